@@ -5,9 +5,9 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use axum::extract::{Request, State};
+use axum::extract::State;
 use axum::http::{HeaderMap, StatusCode, header};
-use axum::middleware::{Next, from_fn_with_state};
+use axum::middleware::from_fn_with_state;
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use axum::{Json, Router};
@@ -15,8 +15,7 @@ use serde_json::json;
 use tokio::sync::watch;
 
 use super::fleet::{NodeView, capacities};
-use super::origin;
-use super::origin::Hosts;
+use super::origin::{Hosts, own_pages};
 use crate::clock::Timestamp;
 use crate::cost::CostModel;
 use crate::engine::Device;
@@ -95,7 +94,6 @@ pub fn admin_router(
     queue: Arc<dyn Queue>,
     cost: Arc<CostModel>,
 ) -> Router {
-    let hosts = Arc::new(hosts);
     Router::new()
         .route("/livez", get(alive))
         .route("/readyz", get(ready))
@@ -107,15 +105,7 @@ pub fn admin_router(
             queue,
             cost,
         })
-        .layer(from_fn_with_state(hosts, own_pages))
-}
-
-/// Refuses calls that a page of another site has made.
-async fn own_pages(State(hosts): State<Arc<Hosts>>, request: Request, next: Next) -> Response {
-    match origin::check(&hosts, &request) {
-        Ok(()) => next.run(request).await,
-        Err(error) => error.into_response(),
-    }
+        .layer(from_fn_with_state(Arc::new(hosts), own_pages))
 }
 
 async fn alive(State(admin): State<Admin>) -> Response {

@@ -6,9 +6,13 @@
 //! (`Origin`) and the host name (`Host`), and both are checked. Other clients can send any value,
 //! but they gain nothing by it.
 
-use axum::extract::Request;
+use std::sync::Arc;
+
+use axum::extract::{Request, State};
 use axum::http::uri::Authority;
 use axum::http::{HeaderMap, Version, header};
+use axum::middleware::Next;
+use axum::response::{IntoResponse, Response};
 
 use super::error::ApiError;
 
@@ -59,6 +63,18 @@ pub(super) fn check(hosts: &Hosts, request: &Request) -> Result<(), ApiError> {
         Ok(())
     } else {
         Err(ApiError::ForeignSite)
+    }
+}
+
+/// Refuses calls that a page of another site has made: a layer of routes.
+pub(super) async fn own_pages(
+    State(hosts): State<Arc<Hosts>>,
+    request: Request,
+    next: Next,
+) -> Response {
+    match check(&hosts, &request) {
+        Ok(()) => next.run(request).await,
+        Err(error) => error.into_response(),
     }
 }
 

@@ -19,7 +19,7 @@ const UNFOLD_FLOOR: u64 = 32 << 20;
 const UNFOLD_RATIO: u64 = 32;
 
 /// The most bytes to which a compressed file may decompress.
-const UNFOLD_CEILING: u64 = 4 << 30;
+pub(super) const UNFOLD_CEILING: u64 = 4 << 30;
 
 /// Bytes to which a compressed file of `file_len` bytes may decompress, all its parts together.
 pub(super) fn unfold_limit(file_len: usize) -> u64 {

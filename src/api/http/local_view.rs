@@ -2,9 +2,9 @@
 
 use std::sync::Arc;
 
-use axum::extract::{Path, Request, State};
+use axum::extract::{Path, State};
 use axum::http::header;
-use axum::middleware::{self, Next};
+use axum::middleware::from_fn_with_state;
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use axum::{Json, Router};
@@ -13,7 +13,7 @@ use bytes::Bytes;
 use super::console;
 use super::scene::{PACKED, Scene, ScenePair};
 use crate::api::error::ApiError;
-use crate::api::origin::{self, Hosts};
+use crate::api::origin::{Hosts, own_pages};
 use crate::job::State as JobState;
 
 /// What to show, encoded for the console.
@@ -52,8 +52,8 @@ struct Shown {
     root: Arc<str>,
 }
 
-/// The console with one scene, at `/#/view/SECRET`: whoever has a login on the machine can connect, and
-/// only who knows the address sees the scene. Pages of other sites are refused.
+/// The console with one scene, at `/#/view/SECRET`. Other logins of the machine do not know the secret, and
+/// see no scene. Pages of other sites are refused.
 pub fn view_router(scene: LocalScene, secret: &str) -> Router {
     let root = format!("/view/{secret}");
     let shown = Shown {
@@ -67,19 +67,12 @@ pub fn view_router(scene: LocalScene, secret: &str) -> Router {
         .route("/tracks", get(tracks))
         .route("/dense", get(dense))
         .with_state(shown);
+    let own = Arc::new(Hosts(Some(Vec::new())));
     Router::new()
         .nest(&root, routes)
         .merge(console::router())
         .fallback(|| async { ApiError::NoRoute })
-        .layer(middleware::from_fn(check_origin))
-}
-
-async fn check_origin(request: Request, next: Next) -> Response {
-    let own = Hosts(Some(Vec::new()));
-    match origin::check(&own, &request) {
-        Ok(()) => next.run(request).await,
-        Err(error) => error.into_response(),
-    }
+        .layer(from_fn_with_state(own, own_pages))
 }
 
 async fn describe(State(Shown { scene, root }): State<Shown>) -> Json<Scene> {

@@ -1,7 +1,6 @@
 //! nuScenes' tracking task: `tracking.json`, the boxes of each sample in the frame of the map.
 //!
-//! Samples are the key frames, of which there are two a second. Boxes of the sweeps between them are
-//! left out.
+//! A sample is a key frame; there are two a second. Boxes of other sweeps are left out.
 
 use std::collections::HashMap;
 use std::path::Path;

@@ -5,7 +5,7 @@ use std::io::Read;
 
 use super::wire::{KIND, Wire};
 use crate::formats::error::{FormatError, shorten};
-use crate::formats::limits::{unfold_budget, unfold_limit};
+use crate::formats::limits::{UNFOLD_CEILING, unfold_budget};
 
 /// What the chunks of a recording have unfolded to so far, bytes.
 #[derive(Default)]
@@ -38,8 +38,7 @@ pub(super) fn unfold<'a>(
     let records = records.ok_or_else(|| KIND.malformed("a chunk is longer than its record"))?;
     so_far.packed += records.len() as u64;
     so_far.unfolded = so_far.unfolded.saturating_add(size);
-    let limit = unfold_budget(so_far.packed).min(unfold_limit(usize::MAX));
-    if size > limit || so_far.unfolded > unfold_budget(so_far.packed) {
+    if size > UNFOLD_CEILING || so_far.unfolded > unfold_budget(so_far.packed) {
         return Err(KIND.too_large(format!(
             "chunks of {} bytes unfold to {}",
             so_far.packed, so_far.unfolded
