@@ -7,6 +7,7 @@
 //!   all pairs have succeeded.
 //! - Cancelled: after a cancellation a job does not succeed.
 //! - Told: every end of a job with a webhook is told, and the files of every forgotten job are removed.
+//! - Key: of the jobs of one idempotency key at most one is durable, but for one that gave the key up before.
 //! - Delivered: what a job delivers was delivered, or given up, before its end is told.
 
 use std::collections::{HashMap, HashSet};
@@ -62,6 +63,9 @@ pub(super) struct Promises {
     unheard: HashSet<(JobId, u32)>,
     /// Jobs that were asked for again by a call that may not have been answered yet.
     asked_again: HashSet<JobId>,
+    /// The idempotency keys that clients sent, with the ids of their submissions.
+    sent_keys: HashMap<JobId, String>,
+    /// The job that took each key last, whether or not its client heard of it.
     keys: HashMap<String, JobId>,
     /// Jobs that have ended once; they may have been queued again since.
     ever_ended: HashSet<JobId>,
@@ -76,8 +80,17 @@ pub(super) struct Promises {
 impl Promises {
     /// A call has begun.
     pub(super) fn asked(&mut self, asked: &Asked) {
-        if let Asked::Requeue(id) = asked {
-            self.asked_again.insert(*id);
+        match asked {
+            Asked::Requeue(id) => {
+                self.asked_again.insert(*id);
+            }
+            Asked::Submit(submission) => {
+                if let Some(idempotency) = &submission.idempotency {
+                    let key = format!("{:?} {}", submission.tenant, idempotency.key);
+                    self.sent_keys.insert(submission.id, key);
+                }
+            }
+            _ => {}
         }
     }
 
@@ -101,13 +114,11 @@ impl Promises {
         match (asked, answer) {
             (Asked::Submit(submission), Ok(Answer::Submitted(submitted))) => {
                 let (Submitted::New(job) | Submitted::Known(job)) = submitted;
-                if let Some(idempotency) = &submission.idempotency {
-                    let key = format!("{:?} {}", job.tenant, idempotency.key);
-                    let before = self.keys.insert(key, job.id).filter(|id| *id != job.id);
-                    let before = before.and_then(|id| self.jobs.get(&id));
-                    assert!(
-                        before.is_none_or(|fact| !fact.is_durable),
-                        "{} is a second job of its key",
+                if job.id != submission.id {
+                    assert_eq!(
+                        self.sent_keys.get(&submission.id),
+                        self.sent_keys.get(&job.id),
+                        "{} is answered for another key",
                         job.id
                     );
                 }
@@ -173,6 +184,7 @@ impl Promises {
         match event {
             Event::Submitted(job) => {
                 self.jobs.entry(job.id).or_default();
+                self.took_key(job.id);
             }
             Event::Started(_) => {}
             Event::LeaseExpired(id) => {
@@ -222,6 +234,19 @@ impl Promises {
                 self.forgotten.insert(*id);
             }
         }
+    }
+
+    /// A new job takes its key. Only a job that is not durable gives its key up.
+    fn took_key(&mut self, id: JobId) {
+        let Some(key) = self.sent_keys.get(&id) else {
+            return;
+        };
+        let before = self.keys.insert(key.clone(), id);
+        let before = before.and_then(|id| self.jobs.get(&id));
+        assert!(
+            before.is_none_or(|fact| !fact.is_durable),
+            "{id} is a second job of its key"
+        );
     }
 
     fn ended(&mut self, job: &Job) {
