@@ -40,6 +40,10 @@ experiment name *arguments:
 fuzz minutes *targets:
     fuzz/run {{minutes}} {{targets}}
 
+# bugs put into a copy of the sources, and which check finds each: just planted no_fence
+planted *bugs:
+    tests/planted/run {{bugs}}
+
 # a server under load, kills and pauses: just soak 60 --state /tmp/soak
 soak minutes *options:
     cargo build --release --locked

@@ -5,6 +5,7 @@
 mod circles;
 mod dependencies;
 mod docs;
+mod planted;
 
 use std::fs;
 use std::path::{Path, PathBuf};
