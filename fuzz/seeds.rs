@@ -205,6 +205,11 @@ impl Seeds {
             "gzip",
             include_bytes!("../tests/formats/scenes/gzip.h5"),
         );
+        self.put(
+            "scene",
+            "lzf",
+            include_bytes!("../tests/formats/scenes/lzf.h5"),
+        );
     }
 
     fn texts(&self) {

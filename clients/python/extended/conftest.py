@@ -1,4 +1,4 @@
-"""What the tests of the boxes of tracks share."""
+"""What these tests share: the program, and a simulated drive with its tracks."""
 
 import json
 import os
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[3]
-PROGRAM = os.environ.get("FNSF_PROGRAM") or str(REPOSITORY / "target/release/fnsf")
+PROGRAM = Path(os.environ.get("FNSF_PROGRAM") or REPOSITORY / "target/release/fnsf")
 
 
 def called(*arguments):

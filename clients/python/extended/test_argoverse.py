@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from conftest import PROGRAM
 
-REPOSITORY = Path(__file__).resolve().parents[3]
-PROGRAM = os.environ.get("FNSF_PROGRAM") or str(REPOSITORY / "target/release/fnsf")
 FLOW = ["flow_tx_m", "flow_ty_m", "flow_tz_m"]
 SWEEPS = ["315966265259836000", "315966265360032000"]
 evaluation = pytest.importorskip("av2.evaluation.scene_flow.eval")

@@ -12,12 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import PROGRAM, REPOSITORY
 
 import fnsf
 import fnsf.bulk
 
-REPOSITORY = Path(__file__).resolve().parents[3]
-PROGRAM = Path(os.environ.get("FNSF_PROGRAM") or REPOSITORY / "target/release/fnsf")
 ROWS = 40
 
 
