@@ -197,7 +197,8 @@ async fn a_real_card_that_is_destroyed_in_the_middle_of_a_job_is_opened_again_an
     let stand = serve(vec![gpu], true).await;
     let id = stand
         .submit(json!({
-            "device": "gpu", "preset": "paper", "max_points": 500, "field": {"max_iterations": 40}
+            "device": "gpu", "preset": "paper", "max_points": 500, "crop_m": 15.0,
+            "field": {"max_iterations": 40}
         }))
         .await;
     let elsewhere = stand
