@@ -9,7 +9,7 @@ use tokio::sync::watch;
 use super::backlog::Backlog;
 use super::effects::Effects;
 use super::lease::{HeartbeatStore, Lease, LeaseHeartbeat};
-use super::local::Local;
+use super::local::{Local, Look};
 use super::node::{Capacities, Node};
 use super::outgoing::{Outgoing, Settled};
 use super::sql::Sql;
@@ -203,7 +203,12 @@ impl<E: Engine> Queue for DatabaseQueue<E> {
         self.engine.watch(id).await
     }
 
-    async fn lease(&self, worker: &str, kind: DeviceKind) -> Result<Lease, QueueError> {
+    async fn lease_while(
+        &self,
+        worker: &str,
+        kind: DeviceKind,
+        wanted: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Option<Lease>, QueueError> {
         let worker: Arc<str> = Arc::from(worker);
         loop {
             let local = self.engine.local();
@@ -213,11 +218,15 @@ impl<E: Engine> Queue for DatabaseQueue<E> {
             let claim = self.change(Kept::Soon, move |sql, effects, options| {
                 leases::claim(sql, effects, options, &name, kind)
             });
-            if let Some(job) = local.look(kind, claim).await? {
-                let flags = local.flags_of(&job);
-                let store = self.engine.heartbeat(&job);
-                let heartbeat = LeaseHeartbeat::new(flags, store);
-                return Ok(Lease { job, heartbeat });
+            match local.look(kind, wanted, claim).await? {
+                Look::Found(job) => {
+                    let flags = local.flags_of(&job);
+                    let store = self.engine.heartbeat(&job);
+                    let heartbeat = LeaseHeartbeat::new(flags, store);
+                    return Ok(Some(Lease { job, heartbeat }));
+                }
+                Look::NotWanted => return Ok(None),
+                Look::Empty => {}
             }
             match self.engine.poll_interval() {
                 None => woken.await,

@@ -27,7 +27,7 @@ pub(super) struct Local {
     ready: Notify,
     /// How often a job may have become ready.
     changes: AtomicU64,
-    looks: [Look; DeviceKind::ALL.len()],
+    looks: [LastLook; DeviceKind::ALL.len()],
     looked: Mutex<Instant>,
     events: mpsc::UnboundedSender<Event>,
     /// Cancelled when nothing can be written any more.
@@ -36,10 +36,20 @@ pub(super) struct Local {
 
 /// The last look for a job by the workers of one kind of device.
 #[derive(Debug, Default)]
-struct Look {
+struct LastLook {
     turn: tokio::sync::Mutex<()>,
     /// The value of `changes` at which there was no job.
     empty_at: AtomicU64,
+}
+
+/// The result of a look for a job.
+pub(super) enum Look<T> {
+    /// A job was claimed.
+    Found(T),
+    /// No job is ready.
+    Empty,
+    /// The worker does not want a job any more. Nothing was claimed.
+    NotWanted,
 }
 
 /// A job that a worker of this process holds.
@@ -165,24 +175,29 @@ impl Local {
         }
     }
 
-    /// Looks for a job with `claim`, unless another worker of this kind has just found none. The
-    /// workers of a kind look one after the other, so that many idle ones cost as much as one.
+    /// Looks for a job with `claim`, unless `wanted` says no or another worker of this kind has just
+    /// found none. The workers of a kind look one after the other, so that many idle ones cost as
+    /// much as one.
     pub(super) async fn look<T, E>(
         &self,
         kind: DeviceKind,
+        wanted: &(dyn Fn() -> bool + Sync),
         claim: impl Future<Output = Result<Option<T>, E>>,
-    ) -> Result<Option<T>, E> {
-        let look = &self.looks[kind as usize];
-        let _turn = look.turn.lock().await;
+    ) -> Result<Look<T>, E> {
+        let last = &self.looks[kind as usize];
+        let _turn = last.turn.lock().await;
+        if !wanted() {
+            return Ok(Look::NotWanted);
+        }
         let changes = self.changes.load(Ordering::Relaxed);
-        if look.empty_at.load(Ordering::Relaxed) == changes {
-            return Ok(None);
+        if last.empty_at.load(Ordering::Relaxed) == changes {
+            return Ok(Look::Empty);
         }
         let found = claim.await?;
         if found.is_none() {
-            look.empty_at.store(changes, Ordering::Relaxed);
+            last.empty_at.store(changes, Ordering::Relaxed);
         }
-        Ok(found)
+        Ok(found.map_or(Look::Empty, Look::Found))
     }
 
     /// Takes over the state of a job as it was just read, `None` if it was removed: for the worker

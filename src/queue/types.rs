@@ -415,12 +415,32 @@ pub trait Queue: Send + Sync {
     /// Waits for the next job that a device of this kind may run, and leases it to `worker`, a name
     /// that is stored with the job. Jobs that require the other kind are skipped.
     ///
+    /// `wanted` is asked before each claim, when a job may have become ready. If it says no, nothing
+    /// is claimed and the result is `None`.
+    ///
     /// If the future is dropped, the lease may already exist. The job is then queued again when the
     /// lease expires.
     ///
     /// # Errors
     /// An error of the store.
-    async fn lease(&self, worker: &str, kind: DeviceKind) -> Result<Lease, QueueError>;
+    async fn lease_while(
+        &self,
+        worker: &str,
+        kind: DeviceKind,
+        wanted: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Option<Lease>, QueueError>;
+
+    /// [`Queue::lease_while`] by a worker that wants a job in any case.
+    ///
+    /// # Errors
+    /// An error of the store.
+    async fn lease(&self, worker: &str, kind: DeviceKind) -> Result<Lease, QueueError> {
+        loop {
+            if let Some(lease) = self.lease_while(worker, kind, &|| true).await? {
+                return Ok(lease);
+            }
+        }
+    }
 
     /// Ends an attempt. Only the latest attempt of a running job counts; for any other the result
     /// is [`Committed::Fenced`]. After a cancellation request, every outcome counts as

@@ -111,9 +111,9 @@ impl Worker {
                 () = self.drain.stop.cancelled() => break,
                 inside = self.isolation.enter() => inside,
             };
-            let mut asking = self
-                .queue
-                .lease(self.lane.device().name(), self.lane.kind());
+            let wanted = || self.wants_a_job();
+            let device = self.lane.device().name();
+            let mut asking = self.queue.lease_while(device, self.lane.kind(), &wanted);
             let lease = tokio::select! {
                 biased;
                 () = self.drain.stop.cancelled() => {
@@ -127,7 +127,8 @@ impl Worker {
                 }
             };
             match lease {
-                Ok(lease) => {
+                Ok(None) => {}
+                Ok(Some(lease)) => {
                     let span = self.span(&lease.job);
                     let attempt = match (self.apart(&lease, &mut inside).await, lease.job.kind) {
                         (Some(ended), _) => ended,
@@ -204,13 +205,20 @@ impl Worker {
 
     /// Releases a job that may have been leased during a shutdown, or while the worker had to
     /// leave.
-    async fn give_back(&self, asking: impl Future<Output = Result<Lease, QueueError>>) {
+    async fn give_back(&self, asking: impl Future<Output = Result<Option<Lease>, QueueError>>) {
         const MOMENT: Duration = Duration::from_millis(100);
-        if let Ok(Ok(lease)) = tokio::time::timeout(MOMENT, asking).await
+        if let Ok(Ok(Some(lease))) = tokio::time::timeout(MOMENT, asking).await
             && let Err(error) = alive(&lease, self.finish(&lease, Outcome::Released)).await
         {
             tracing::warn!(%error, job = %lease.job.id, "a job was not given back");
         }
+    }
+
+    /// Whether the worker can run a job now: its device is ready and no shutdown has begun. The job
+    /// of a device that was lost is queued again while the device is being reopened, and another
+    /// lane of that device must not claim it.
+    fn wants_a_job(&self) -> bool {
+        !self.drain.stop.is_cancelled() && *self.lane.device().health().borrow() == Health::Ready
     }
 
     /// Waits until the device is ready; false if the worker has to stop.

@@ -283,6 +283,23 @@ async fn a_lost_device_returns_the_job_to_the_queue_and_does_it_again() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_idle_lane_of_a_lost_device_takes_no_job_until_the_device_is_open_again() {
+    let stand = stand_with(2, None).await;
+    stand.switches.brake.store(true, Ordering::Relaxed);
+    let job = stand.submit(2).await;
+    for lane in stand.worker.lane.device().lanes() {
+        let worker = stand.worker.clone();
+        tokio::spawn(Worker { lane, ..worker }.run());
+    }
+    stand.switches.until_at_the_brake(1).await;
+    stand.switches.refusals.store(2, Ordering::Relaxed);
+    stand.switches.destroy();
+    stand.switches.brake.store(false, Ordering::Relaxed);
+    let done = stand.ended(&job).await;
+    assert_eq!((done.state, done.attempt), (State::Succeeded, 2));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_pair_that_does_not_fit_moves_where_there_is_another_kind_and_fails_where_there_is_none()
 {
     for overflow_kind in [Some(DeviceKind::Cpu), None] {

@@ -1,5 +1,7 @@
 //! Device requirements: which device kind runs a job, and jobs whose device is lost or too small.
 
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use super::*;
 
 fn needs(kind: DeviceKind) -> Submission {
@@ -47,6 +49,21 @@ pub(crate) async fn jobs_that_wait_for_one_kind_hold_up_no_other(stand: &mut imp
     let only_for = |kind| queue.backlog().queued_only_for(kind).jobs;
     assert_eq!(DeviceKind::ALL.map(only_for), [0, 20]);
     assert_eq!((ahead(Some(DeviceKind::Cpu)), ahead(None)), (0.0, 0.0));
+}
+
+pub(crate) async fn a_worker_that_wants_no_job_any_more_claims_none(stand: &mut impl Stand) {
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
+    let wants = AtomicBool::new(true);
+    let wanted = || wants.load(Ordering::Relaxed);
+    let mut asking = queue.lease_while("worker", DeviceKind::Cpu, &wanted);
+    let soon = timeout(Duration::from_millis(50), &mut asking).await;
+    assert!(soon.is_err(), "no job is ready");
+    wants.store(false, Ordering::Relaxed);
+    let job = submit(&queue, submission("a")).await;
+    let asked = timeout(PATIENCE, asking).await.expect("in time");
+    assert!(asked.expect("the store works").is_none());
+    let held = lease(&queue).await;
+    assert_eq!((held.job.id, held.job.attempt), (job.id, 1));
 }
 
 pub(crate) async fn a_job_that_moves_waits_for_the_other_kind_without_blame(

@@ -74,6 +74,7 @@ macro_rules! queue_contract {
             lists_are_latest_first_in_pages_and_of_one_tenant,
             a_job_goes_only_to_the_kind_of_device_that_it_needs,
             jobs_that_wait_for_one_kind_hold_up_no_other,
+            a_worker_that_wants_no_job_any_more_claims_none,
             a_job_that_moves_waits_for_the_other_kind_without_blame,
             a_device_that_dies_under_a_job_again_and_again_ends_it,
             jobs_for_a_kind_survive_a_crash,
