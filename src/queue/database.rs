@@ -8,6 +8,7 @@ use tokio::sync::watch;
 
 use super::backlog::Backlog;
 use super::effects::Effects;
+use super::interface::Queue;
 use super::lease::{HeartbeatStore, Lease, LeaseHeartbeat};
 use super::local::{Local, Look};
 use super::node::{Capacities, Node};
@@ -16,9 +17,7 @@ use super::sql::Sql;
 use super::standing::Standing;
 use super::transitions;
 use super::transitions::{expiry, leases, lists, outbox, standing};
-use super::types::{
-    Committed, Filter, Outcome, Queue, QueueError, QueueOptions, Submission, Submitted,
-};
+use super::types::{Committed, Filter, Outcome, QueueError, QueueOptions, Submission, Submitted};
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, Job, JobId, Tenant};
 use crate::sync::locked;

@@ -11,6 +11,7 @@ mod backlog;
 mod contract_tests;
 mod database;
 mod effects;
+mod interface;
 mod lease;
 mod local;
 mod migration;
@@ -26,6 +27,7 @@ mod transitions;
 mod types;
 
 pub use backlog::{Backlog, Load};
+pub use interface::Queue;
 pub use lease::{Lease, LeaseHeartbeat, Signal};
 pub use migration::Migration;
 pub use node::{Capacities, Capacity, Node};
@@ -36,6 +38,6 @@ pub use sqlite::simulation;
 pub use sqlite::{CopiedQueue, copy_sqlite, migrate_sqlite, open_sqlite, read_copy};
 pub use standing::Standing;
 pub use types::{
-    Committed, Event, Filter, Idempotency, Outcome, PairOf, Queue, QueueError, QueueOptions,
-    Submission, Submitted,
+    Committed, Event, Filter, Idempotency, Outcome, PairOf, QueueError, QueueOptions, Submission,
+    Submitted,
 };

@@ -16,11 +16,12 @@ use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
+use super::interface::Queue;
 use super::lease::{Lease, Signal};
 use super::standing::Standing;
 use super::types::{
-    Committed, Event, Filter, Idempotency, Outcome, PairOf, Queue, QueueError, QueueOptions,
-    Submission, Submitted,
+    Committed, Event, Filter, Idempotency, Outcome, PairOf, QueueError, QueueOptions, Submission,
+    Submitted,
 };
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, Job, JobError, JobId, JobProgress, Kind, Priority, State, Tenant};

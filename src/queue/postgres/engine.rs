@@ -21,13 +21,14 @@ use super::upkeep::Upkeep;
 use crate::job::{Job, JobId};
 use crate::queue::database::{DatabaseQueue, Engine, Kept};
 use crate::queue::effects::Effects;
+use crate::queue::interface::Queue;
 use crate::queue::lease::HeartbeatStore;
 use crate::queue::local::Local;
 use crate::queue::migration::Migration;
 use crate::queue::node::{Capacities, Node};
 use crate::queue::sql::{Sql, values};
 use crate::queue::transitions;
-use crate::queue::types::{Event, Queue, QueueError, QueueOptions};
+use crate::queue::types::{Event, QueueError, QueueOptions};
 
 /// Interval at which idle workers look for a job, if no notification wakes them.
 const POLL_INTERVAL: Duration = Duration::from_secs(1);

@@ -19,6 +19,7 @@ use crate::clock::Timestamp;
 use crate::job::{Job, JobId};
 use crate::queue::database::{DatabaseQueue, Engine, Kept};
 use crate::queue::effects::Effects;
+use crate::queue::interface::Queue;
 use crate::queue::lease::HeartbeatStore;
 use crate::queue::local::Local;
 use crate::queue::migration::Migration;
@@ -26,7 +27,7 @@ use crate::queue::node::{Capacities, Node};
 use crate::queue::sql::Sql;
 use crate::queue::transitions;
 use crate::queue::transitions::{expiry, lists};
-use crate::queue::types::{Event, Queue, QueueError, QueueOptions};
+use crate::queue::types::{Event, QueueError, QueueOptions};
 use crate::sync::locked;
 
 /// Connections for reading.

@@ -12,10 +12,11 @@ use super::statements::SqliteSql;
 use crate::job::{DeviceKind, State, Tenant};
 use crate::queue::contract_tests::{Stand, queue_contract, submission};
 use crate::queue::database::Engine;
+use crate::queue::interface::Queue;
 use crate::queue::lease::Signal;
 use crate::queue::sql::for_sqlite;
 use crate::queue::transitions::{expiry, fair_queue, leases, lists, outbox, standing};
-use crate::queue::types::{Event, Filter, Queue, QueueError, QueueOptions};
+use crate::queue::types::{Event, Filter, QueueError, QueueOptions};
 
 /// A folder in which the queue is opened repeatedly.
 struct Folder(tempfile::TempDir);

@@ -12,10 +12,11 @@ use super::engine::{migrate_postgres, open_postgres};
 use super::target::PostgresOptions;
 use crate::job::DeviceKind;
 use crate::queue::contract_tests::{Stand, queue_contract, submission};
+use crate::queue::interface::Queue;
 use crate::queue::migration::Migration;
 use crate::queue::sql::for_postgres;
 use crate::queue::transitions::{expiry, fair_queue, leases, standing};
-use crate::queue::types::{Event, Queue, QueueOptions, Submitted};
+use crate::queue::types::{Event, QueueOptions, Submitted};
 
 #[path = "../../../../tests/common/postgres_server.rs"]
 mod postgres_server;

@@ -11,9 +11,10 @@ use super::{Database, Server, start_postgres};
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, JobId, JobProgress, Priority, State};
 use crate::queue::contract_tests::{done, submission};
+use crate::queue::interface::Queue;
 use crate::queue::lease::{Lease, Signal};
 use crate::queue::types::{
-    Committed, Event, Idempotency, Outcome, Queue, QueueOptions, Submission, Submitted,
+    Committed, Event, Idempotency, Outcome, QueueOptions, Submission, Submitted,
 };
 
 /// Timeout, long enough for a loaded machine. Only a failing test waits this long.

@@ -10,11 +10,12 @@ use tokio::sync::mpsc;
 
 use super::engine::SimulatedEngine;
 use crate::queue::database::DatabaseQueue;
+use crate::queue::interface::Queue;
 use crate::queue::local::Local;
 use crate::queue::sqlite::engine::recover;
 use crate::queue::sqlite::schema::create;
 use crate::queue::sqlite::writer::{Command, Turns, Writer};
-use crate::queue::types::{Event, Queue, QueueOptions};
+use crate::queue::types::{Event, QueueOptions};
 use crate::sync::locked;
 
 const DATABASE: &str = "main";

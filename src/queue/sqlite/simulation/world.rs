@@ -13,12 +13,13 @@ use super::rows;
 use super::steps::{Bytes, Step, WORKERS, succeeded};
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, Job, JobId};
+use crate::queue::interface::Queue;
 use crate::queue::lease::{Lease, Signal};
 use crate::queue::outgoing::{Outgoing, Settled};
 use crate::queue::sqlite::statements::SqliteSql;
 use crate::queue::time;
 use crate::queue::transitions;
-use crate::queue::types::{Outcome, Queue, QueueError, QueueOptions};
+use crate::queue::types::{Outcome, QueueError, QueueOptions};
 use crate::sync::locked;
 
 /// Steps of a schedule, at most.
