@@ -10,6 +10,7 @@ WORKDIR /build
 COPY Cargo.toml Cargo.lock build.rs ./
 COPY proto proto
 COPY benches benches
+COPY examples examples
 COPY console console
 COPY clients/python/Cargo.toml clients/python/build.rs clients/python/
 COPY clients/python/src clients/python/src
