@@ -177,8 +177,8 @@ fn flow(bytes: &[u8]) {
         file.valid.map(|valid| valid.len()),
         file.dynamic.map(|dynamic| dynamic.len()),
         file.cluster.as_ref().map(Vec::len),
-        file.confidence.map(|chances| chances.len()),
-        file.moving.map(|chances| chances.len()),
+        file.confidence.map(|probabilities| probabilities.len()),
+        file.moving.map(|probabilities| probabilities.len()),
     ];
     assert!(
         counts.into_iter().flatten().all(|count| count == rows),

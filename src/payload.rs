@@ -46,7 +46,7 @@ pub struct StoredFlow {
     /// N flags: true for points whose residual motion is at least 0.05 m, if the ego motion is
     /// known.
     pub dynamic: Option<Vec<bool>>,
-    /// Clusters of the points, confidence of their flow and chances that they move, if known.
+    /// Clusters of the points, confidence of their flow and probabilities that they move, if known.
     pub objects: Option<Objects>,
     /// The ego motion target_from_source, translation in metres, if known.
     pub ego: Option<RigidTransform>,
@@ -195,8 +195,8 @@ impl Writer {
             return;
         };
         self.words(objects.cluster.iter().map(|id| id.cast_unsigned()));
-        let chances = objects.confidence.iter().chain(&objects.moving);
-        self.words(chances.map(|chance| chance.to_bits()));
+        let probabilities = objects.confidence.iter().chain(&objects.moving);
+        self.words(probabilities.map(|probability| probability.to_bits()));
         self.0.extend((objects.clusters.len() as u64).to_le_bytes());
         for cluster in &objects.clusters {
             self.words([cluster.points, u32::from(cluster.dynamic)].into_iter());

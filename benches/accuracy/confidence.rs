@@ -1,4 +1,4 @@
-//! Fits the logistic regressions of the two chances of a point, its confidence and the chance that it
+//! Fits the logistic regressions of the two probabilities of a point, its confidence and the probability that it
 //! moves, and evaluates their calibration.
 //!
 //! ```text
@@ -34,16 +34,16 @@ struct Evaluated {
     moves: Option<bool>,
 }
 
-/// A chance of a point.
+/// A probability of a point.
 #[derive(Clone, Copy)]
-enum Chance {
+enum Probability {
     /// That its error is below [`CONFIDENT_WITHIN_M`].
     Within,
     /// That it moves.
     Moves,
 }
 
-impl Chance {
+impl Probability {
     /// Number of features that it uses. The last feature of all, the displacement, makes the confidence
     /// worse on streets that are not in the fit.
     fn features(self) -> usize {
@@ -53,7 +53,7 @@ impl Chance {
         }
     }
 
-    /// Whether the chance is right about a point, where that is known.
+    /// Whether the probability is right about a point, where that is known.
     fn is_right(self, point: &Evaluated) -> Option<bool> {
         match self {
             Self::Within => Some(point.error_m < f64::from(CONFIDENT_WITHIN_M)),
@@ -150,17 +150,17 @@ fn judged(backend: &dyn Backend, known: LabelledPair, weight: f64) -> Scene {
     }
 }
 
-/// Fits the weights of one class for one chance by Newton's method on the penalized likelihood. The points of a
+/// Fits the weights of one class for one probability by Newton's method on the penalized likelihood. The points of a
 /// scene share its weight equally. All training streets together weigh as much as three labelled
 /// pairs.
-fn fitted(scenes: &[&Scene], kind: usize, chance_of: Chance) -> Vec<f64> {
+fn fitted(scenes: &[&Scene], kind: usize, probability_of: Probability) -> Vec<f64> {
     const PENALTY: f64 = 1e-3;
     const STEPS: usize = 30;
     let count = scenes
         .iter()
         .flat_map(|s| &s.points)
         .find(|p| p.kind == kind)
-        .map_or(0, |p| p.features.len().min(chance_of.features()));
+        .map_or(0, |p| p.features.len().min(probability_of.features()));
     let mut weights = DVector::<f64>::zeros(count);
     for _ in 0..STEPS {
         let mut normal = DMatrix::<f64>::identity(count, count) * PENALTY;
@@ -168,15 +168,20 @@ fn fitted(scenes: &[&Scene], kind: usize, chance_of: Chance) -> Vec<f64> {
         for scene in scenes {
             let of_kind = || {
                 let points = scene.points.iter().filter(|p| p.kind == kind);
-                points.filter_map(|point| Some((point, chance_of.is_right(point)?)))
+                points.filter_map(|point| Some((point, probability_of.is_right(point)?)))
             };
             let share = scene.weight / of_kind().count().max(1) as f64;
             for (point, right) in of_kind() {
                 let features = DVector::from_column_slice(&point.features[..count]);
-                let chance = 1.0 / (1.0 + (-weights.dot(&features)).exp());
+                let probability = 1.0 / (1.0 + (-weights.dot(&features)).exp());
                 let right = f64::from(u8::from(right));
-                gradient.axpy(share * (right - chance), &features, 1.0);
-                normal.ger(share * chance * (1.0 - chance), &features, &features, 1.0);
+                gradient.axpy(share * (right - probability), &features, 1.0);
+                normal.ger(
+                    share * probability * (1.0 - probability),
+                    &features,
+                    &features,
+                    1.0,
+                );
             }
         }
         let Some(cholesky) = normal.cholesky() else {
@@ -187,7 +192,7 @@ fn fitted(scenes: &[&Scene], kind: usize, chance_of: Chance) -> Vec<f64> {
     weights.iter().copied().collect()
 }
 
-fn chance(weights: &[Vec<f64>], point: &Evaluated) -> f64 {
+fn probability(weights: &[Vec<f64>], point: &Evaluated) -> f64 {
     let sum: f64 = weights[point.kind]
         .iter()
         .zip(&point.features)
@@ -196,7 +201,7 @@ fn chance(weights: &[Vec<f64>], point: &Evaluated) -> f64 {
     1.0 / (1.0 + (-sum).exp())
 }
 
-/// The calibration of a chance on the points off the ground of some scenes.
+/// The calibration of a probability on the points off the ground of some scenes.
 struct Told {
     calibration: Calibration,
     /// EPE of the half of the points with the smallest errors, divided by that of the other half.
@@ -205,7 +210,7 @@ struct Told {
 }
 
 impl Told {
-    fn new(scenes: &[&Scene], weights: &[Vec<f64>], of: Chance) -> Result<Self, &'static str> {
+    fn new(scenes: &[&Scene], weights: &[Vec<f64>], of: Probability) -> Result<Self, &'static str> {
         let off_ground = scenes.iter().flat_map(|scene| &scene.points);
         let off_ground = || {
             off_ground
@@ -215,7 +220,7 @@ impl Told {
         let mut reliability = Reliability::default();
         for point in off_ground() {
             if let Some(right) = of.is_right(point) {
-                reliability.add(chance(weights, point), right, point.error_m);
+                reliability.add(probability(weights, point), right, point.error_m);
             }
         }
         let mut errors: Vec<f64> = off_ground().map(|point| point.error_m).collect();
@@ -227,7 +232,7 @@ impl Told {
         })
     }
 
-    fn print(&self, name: &str, of: Chance) {
+    fn print(&self, name: &str, of: Probability) {
         let Calibration {
             points,
             error,
@@ -239,12 +244,12 @@ impl Told {
         } = self.calibration;
         let share = |share: Option<f64>| share.map_or("-".to_owned(), |s| format!("{s:.3}"));
         match of {
-            Chance::Within => println!(
+            Probability::Within => println!(
                 "| {name} | {points} | {sure_half_epe:.4} | {rest_epe:.4} | {:.2} | {:.2} | {error:.3} |",
                 sure_half_epe / rest_epe,
                 self.best,
             ),
-            Chance::Moves => println!(
+            Probability::Moves => println!(
                 "| {name} | {points} | {} | {} | {error:.4} |",
                 share(recall),
                 share(precision)
@@ -288,7 +293,7 @@ fn diagram(shown: &[(String, Told)]) -> String {
         );
         let line: Vec<String> = bins
             .iter()
-            .map(|bin| at(bin.chance, bin.right))
+            .map(|bin| at(bin.probability, bin.right))
             .map(|(x, y)| format!("{x:.1},{y:.1}"))
             .collect();
         svg += &format!(
@@ -296,7 +301,7 @@ fn diagram(shown: &[(String, Told)]) -> String {
             line.join(" ")
         );
         for bin in bins {
-            let (x, y) = at(bin.chance, bin.right);
+            let (x, y) = at(bin.probability, bin.right);
             let radius = 2.0 + 12.0 * bin.share.sqrt();
             svg += &format!(
                 "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"{radius:.1}\" fill=\"#1f77b4\" fill-opacity=\"0.6\"/>\n"
@@ -332,9 +337,9 @@ impl Scenes {
         })
     }
 
-    /// Fits the weights of a chance, prints them and the table of its calibration, and returns what
+    /// Fits the weights of a probability, prints them and the table of its calibration, and returns what
     /// the diagram shows.
-    fn evaluate(&self, of: Chance) -> Result<Vec<(String, Told)>, String> {
+    fn evaluate(&self, of: Probability) -> Result<Vec<(String, Told)>, String> {
         let all: Vec<&Scene> = self.known.iter().chain(&self.pairs).collect();
         let fitted = |scenes: &[&Scene]| -> Vec<Vec<f64>> {
             let kinds = 0..KINDS.len();
@@ -345,11 +350,11 @@ impl Scenes {
             println!("{kind}: {weights:.3?}");
         }
         match of {
-            Chance::Within => println!(
+            Probability::Within => println!(
                 "\n| scenes | points | sure half | rest | ratio | best ratio | calibration error |\n\
                  |---|---|---|---|---|---|---|"
             ),
-            Chance::Moves => println!(
+            Probability::Moves => println!(
                 "\n| scenes | points | recall at 0.5 | precision at 0.5 | calibration error |\n\
                  |---|---|---|---|---|"
             ),
@@ -386,10 +391,10 @@ impl Scenes {
 
 pub(super) fn run(arguments: &[String]) -> Result<(), String> {
     let scenes = Scenes::new()?;
-    println!("## Chance that a point moves");
-    scenes.evaluate(Chance::Moves)?;
+    println!("## Probability that a point moves");
+    scenes.evaluate(Probability::Moves)?;
     println!("\n## Confidence");
-    let shown = scenes.evaluate(Chance::Within)?;
+    let shown = scenes.evaluate(Probability::Within)?;
     if let Some(path) = arguments.first() {
         std::fs::write(path, diagram(&shown)).map_err(|error| format!("{path}: {error}"))?;
     }

@@ -15,7 +15,7 @@ export const COLORS = {
   height: { text: "height", needs: () => true },
   cluster: { text: "cluster", needs: (frame) => frame.pair?.cluster, why: "the method finds no clusters" },
   confidence: { text: "confidence", needs: (frame) => frame.pair?.confidence, why: "the method gives no confidence" },
-  moving: { text: "chance of motion", needs: (frame) => frame.pair?.moving, why: "the method gives no chance of motion" },
+  moving: { text: "probability of motion", needs: (frame) => frame.pair?.moving, why: "the method gives no probability of motion" },
 };
 
 /** The height of the ground: a low quantile of the points' heights near the sensor. */

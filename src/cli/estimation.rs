@@ -35,8 +35,9 @@ pub(super) struct Estimation {
     preset: PresetChoice,
     /// Device for neural, paper, fnsf-linear, nsfp-baseline and nsfp-linear: auto (a GPU, else the
     /// CPU), cpu, gpu, or gpu:CARD, where CARD is a GPU's number, PCI id or part of its name, as
-    /// listed by fnsf doctor. default and label are computed on the CPU whatever the device, and the
-    /// other presets refuse a GPU
+    /// listed by fnsf doctor. default and label are computed on the CPU; a GPU that is asked for
+    /// searches their clusters where the host has at most four threads. The other presets refuse a
+    /// GPU
     #[arg(long, value_name = "DEVICE", default_value_t)]
     device: DeviceArgument,
     /// CPU threads, 1 to 256; all cores by default. The result does not depend on it

@@ -28,7 +28,7 @@ use crate::flow::{Control, Progress};
 pub(super) struct Submit {
     #[command(flatten)]
     server: ServerFlags,
-    /// Sweeps in the order of time, in any format that fnsf flow reads
+    /// Sweeps in the order of time, in any format that the service reads
     #[arg(required = true, num_args = 1.., value_name = "SWEEP")]
     sweeps: Vec<PathBuf>,
     /// File for the result; its extension chooses the format

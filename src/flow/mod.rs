@@ -72,8 +72,8 @@ pub use field::{Network, Snapshot, SnapshotError, TrainerState};
 pub use host::{Host, HostError};
 pub use motion::{MotionField, Residual, SampledMotion};
 pub use objects::{
-    CONFIDENT_WITHIN_M, Chances, Cluster, ClusterLabels, ConfidenceFeatures, FoundRecord,
-    ObjectMotions, ObjectSearch, Objects, PackedScene, SearchClouds, SearchSeconds,
+    CONFIDENT_WITHIN_M, Cluster, ClusterLabels, ConfidenceFeatures, FoundRecord, ObjectMotions,
+    ObjectSearch, Objects, PackedScene, Probabilities, SearchClouds, SearchSeconds,
 };
 pub use options::*;
 pub use problem::{NeighborSweep, Problem};

@@ -155,7 +155,7 @@ pub(super) fn check_category(
 }
 
 /// A probability, 0 to 1.
-pub(super) fn check_chance(
+pub(super) fn check_probability(
     kind: FileKind,
     row: usize,
     column: &str,

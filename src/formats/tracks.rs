@@ -13,7 +13,7 @@ use std::io::Write;
 use serde::{Deserialize, Serialize};
 
 use super::error::{FileKind, FormatError};
-use super::limits::{check_chance, check_value};
+use super::limits::{check_probability, check_value};
 use crate::flow::OrientedBox;
 use crate::flow::tracks::{Track, TrackState};
 
@@ -77,7 +77,7 @@ impl StateJson {
             velocity: point("velocity", self.velocity)?,
             yaw_rate: value("yaw_rate", self.yaw_rate)?,
             points: self.points,
-            confidence: check_chance(KIND, row, "confidence", f64::from(self.confidence))?,
+            confidence: check_probability(KIND, row, "confidence", f64::from(self.confidence))?,
         })
     }
 }

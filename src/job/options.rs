@@ -63,8 +63,9 @@ pub struct JobOptions {
     #[schema(value_type = Option<Object>)]
     pub ego: Option<EgoChoice>,
     /// The device for the computation. `neural`, `paper`, `fnsf-linear`, `nsfp-baseline` and
-    /// `nsfp-linear` can use a GPU. `default` and `label` always compute on the host's CPU. The
-    /// other presets compute on the CPU and refuse `gpu`.
+    /// `nsfp-linear` can use a GPU. `default` and `label` compute on the host's CPU; a GPU searches
+    /// their clusters where the host has few threads. The other presets compute on the CPU and
+    /// refuse `gpu`.
     pub device: DeviceChoice,
     /// `f32`: single precision. `f16`: half precision, for `neural` and `paper` on a GPU whose
     /// matrix units pass their self-test.

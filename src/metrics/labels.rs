@@ -14,8 +14,8 @@ pub const PHASES: [&str; 8] = [
     "total",
 ];
 /// Values of the label `reason` of `fnsf_requests_rejected_total`. `unauthorized` counts the error
-/// codes `unauthenticated`, `forbidden`, `priority` and `foreign_site`. Each other value counts the
-/// code of the same name. `bad_input` also counts `bad_request` and `invalid_options`, and
+/// codes `unauthenticated`, `forbidden`, `priority`, `foreign_site` and `link_expired`. Each other
+/// value counts the code of the same name. `bad_input` also counts `bad_request` and `invalid_options`, and
 /// `too_slow` also counts `taken_too_slowly`.
 pub const REJECTIONS: [&str; 10] = [
     "no_device",

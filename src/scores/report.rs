@@ -35,7 +35,7 @@ pub struct Report {
     pub bucket_normalized: Option<BucketNormalizedReport>,
     /// Calibration of the confidence; none where the flow has none.
     pub confidence: Option<ConfidenceReport>,
-    /// Calibration of the chance of motion; none where the flow has none.
+    /// Calibration of the probability of motion; none where the flow has none.
     pub moving: Option<MovingReport>,
 }
 
@@ -80,11 +80,11 @@ pub struct ConfidenceReport {
     pub rest_epe: f64,
 }
 
-/// The chance that a point moves. Recall and precision are of the points with 0.5 or more; null where
+/// The probability that a point moves. Recall and precision are of the points with 0.5 or more; null where
 /// none moves, or none has that.
 #[derive(Debug, Serialize)]
 pub struct MovingReport {
-    /// Mean distance of the chance from the share of moving points.
+    /// Mean distance of the probability from the share of moving points.
     pub calibration_error: f64,
     /// Share of the moving points that have 0.5 or more.
     pub recall: Option<f64>,

@@ -174,7 +174,7 @@ fn json_and_npz_hold_the_clusters_themselves() {
 }
 
 #[test]
-fn senseless_clusters_and_chances_are_refused_by_name() {
+fn senseless_clusters_and_probabilities_are_refused_by_name() {
     let read = |key: &str| {
         let text = format!(r#"{{"flow":[[0,0,0]],{key}}}"#);
         read_flow(text.as_bytes(), None).unwrap_err().to_string()

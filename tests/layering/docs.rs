@@ -172,3 +172,32 @@ fn every_link_between_pages_resolves() {
     assert!(all.len() > 20, "{all:?}");
     assert_eq!(broken, [""; 0]);
 }
+
+/// A path in the repository that stands in backticks, if `quoted` is one. Names in capitals stand for others.
+fn named_path(quoted: &str) -> Option<&str> {
+    const FOLDERS: [&str; 9] = [
+        "src", "tests", "docs", "benches", "deploy", "clients", "console", "fuzz", "proto",
+    ];
+    let (folder, rest) = quoted.split_once('/')?;
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "._-/".contains(c);
+    let is_path = FOLDERS.contains(&folder) && !rest.is_empty() && rest.chars().all(is_plain);
+    (is_path && !rest.contains("NAME")).then_some(quoted)
+}
+
+#[test]
+fn every_file_that_a_page_names_is_there() {
+    let mut all = Vec::new();
+    pages(root(), &mut all);
+    let (mut named, mut missing) = (0, Vec::new());
+    for page in &all {
+        let text = fs::read_to_string(page).expect("a page is readable");
+        for path in text.split('`').filter_map(named_path) {
+            named += 1;
+            if !root().join(path).exists() {
+                missing.push(format!("{}: {path}", page.display()));
+            }
+        }
+    }
+    assert!(named > 200, "{named}");
+    assert_eq!(missing, [""; 0]);
+}

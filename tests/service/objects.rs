@@ -76,8 +76,12 @@ async fn clusters_and_confidence_are_the_librarys_in_every_format_and_over_grpc(
                     (&mut confidence, &piece.confidence),
                     (&mut moving, &piece.moving),
                 ] {
-                    let (chances, _) = bytes.as_chunks::<4>();
-                    all.extend(chances.iter().map(|chance| f32::from_le_bytes(*chance)));
+                    let (probabilities, _) = bytes.as_chunks::<4>();
+                    all.extend(
+                        probabilities
+                            .iter()
+                            .map(|probability| f32::from_le_bytes(*probability)),
+                    );
                 }
             }
         }

@@ -181,12 +181,12 @@ pub(super) fn pieces(
             clusters.extend(described.iter().map(convert::cluster));
             let ids = objects.cluster[from..to].iter();
             cluster.extend(ids.flat_map(|id| id.to_le_bytes()));
-            for (bytes, chances) in [
+            for (bytes, probabilities) in [
                 (&mut confidence, &objects.confidence),
                 (&mut moving, &objects.moving),
             ] {
-                let chances = chances[from..to].iter();
-                bytes.extend(chances.flat_map(|chance| chance.to_le_bytes()));
+                let probabilities = probabilities[from..to].iter();
+                bytes.extend(probabilities.flat_map(|probability| probability.to_le_bytes()));
             }
         }
         proto::FlowChunk {

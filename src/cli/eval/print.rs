@@ -39,7 +39,7 @@ pub(super) fn print(report: &Report) -> Result<(), Failure> {
     }
     if let Some(moving) = &report.moving {
         say(format_args!(
-            "  moving from a chance of 0.5: recall {}, precision {}, calibration error {:.3}",
+            "  moving from a probability of 0.5: recall {}, precision {}, calibration error {:.3}",
             share(moving.recall),
             share(moving.precision),
             moving.calibration_error

@@ -12,7 +12,7 @@ use crate::flow::data::{Control, DYNAMIC_M, Point, transform_point};
 use crate::flow::error::FlowError;
 use crate::flow::field::{Backend, Snapshot, SnapshotError};
 use crate::flow::motion::MotionField;
-use crate::flow::objects::Chances;
+use crate::flow::objects::Probabilities;
 use crate::flow::options::{CERTAIN_OVERLAP, Ego, LEAST_OVERLAP, Method, Options};
 use crate::flow::problem::Problem;
 use crate::flow::select::select;
@@ -165,15 +165,15 @@ fn assemble(input: &Input<'_>, solved: Solved, [began, selected_at]: [f64; 2]) -
             flow[row] = core::array::from_fn(|a| to[a] - from[a]);
             valid[row] = true;
             if let Some(objects) = &mut objects {
-                let chances = Chances::of_ground(to[0].hypot(to[1]));
-                objects.confidence[row] = chances.confidence;
-                objects.moving[row] = chances.moving;
+                let probabilities = Probabilities::of_ground(to[0].hypot(to[1]));
+                objects.confidence[row] = probabilities.confidence;
+                objects.moving[row] = probabilities.moving;
             }
         }
     }
     if let Some(objects) = objects {
         objects.clear_invalid(&valid);
-        objects.scale_chances(certainty(overlap));
+        objects.scale_probabilities(certainty(overlap));
     }
     Estimate {
         flow,

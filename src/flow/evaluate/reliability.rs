@@ -1,8 +1,8 @@
-//! Calibration of the two chances of a point: reliability diagram and expected calibration error.
+//! Calibration of the two probabilities of a point: reliability diagram and expected calibration error.
 //!
-//! The confidence is right if the end-point error is below [`CONFIDENT_WITHIN_M`], the chance of
+//! The confidence is right if the end-point error is below [`CONFIDENT_WITHIN_M`], the probability of
 //! motion if the point moves. The expected calibration error is the mean absolute difference
-//! between the chance and the share of points where it is right, over ten bins of the chance,
+//! between the probability and the share of points where it is right, over ten bins of the probability,
 //! weighted by points (Guo et al. 2017).
 
 use super::truth::{EvaluateError, Truth, double, end_point_error};
@@ -11,13 +11,13 @@ use crate::flow::objects::CONFIDENT_WITHIN_M;
 
 /// Bins of the reliability diagram.
 const BINS: usize = 10;
-/// Histogram cells of the chance, in which errors are summed. Points in one cell are not
+/// Histogram cells of the probability, in which errors are summed. Points in one cell are not
 /// distinguished.
 const CELLS: usize = 1000 * BINS;
 
-/// Accumulator of chances and end-point errors over many pairs, in constant memory.
+/// Accumulator of probabilities and end-point errors over many pairs, in constant memory.
 ///
-/// Chances are counted in 10,000 cells of equal width. Points in the same cell are not
+/// Probabilities are counted in 10,000 cells of equal width. Points in the same cell are not
 /// distinguished: each counts with the mean error of its cell.
 #[derive(Clone, Debug)]
 pub struct Reliability {
@@ -26,27 +26,27 @@ pub struct Reliability {
 
 #[derive(Clone, Copy, Debug, Default)]
 struct Cell {
-    chance: f64,
+    probability: f64,
     error_m: f64,
     right: f64,
     points: f64,
 }
 
-/// Calibration of a chance.
+/// Calibration of a probability.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Calibration {
     /// Number of points.
     pub points: usize,
-    /// Expected calibration error, 0 to 1: the mean absolute difference between the chance and the
+    /// Expected calibration error, 0 to 1: the mean absolute difference between the probability and the
     /// share of points where it is right over the bins, weighted by points (Guo et al. 2017).
     pub error: f64,
-    /// Share, 0 to 1, of the points where the chance is right that have a chance of 0.5 or more. None
+    /// Share, 0 to 1, of the points where the probability is right that have a probability of 0.5 or more. None
     /// if it is right nowhere.
     pub recall: Option<f64>,
-    /// Share, 0 to 1, of the points with a chance of 0.5 or more where it is right. None if there
+    /// Share, 0 to 1, of the points with a probability of 0.5 or more where it is right. None if there
     /// are none.
     pub precision: Option<f64>,
-    /// EPE of the half of the points with the higher chance, metres. A cell across the boundary
+    /// EPE of the half of the points with the higher probability, metres. A cell across the boundary
     /// between the halves counts partly in each, with its mean error.
     pub sure_half_epe: f64,
     /// EPE of the other half, metres.
@@ -61,9 +61,9 @@ pub struct Calibration {
 pub struct CalibrationBin {
     /// Share of all points that are in the bin, 0 to 1.
     pub share: f64,
-    /// Mean chance of its points, 0 to 1.
-    pub chance: f64,
-    /// Share of its points where the chance is right, 0 to 1.
+    /// Mean probability of its points, 0 to 1.
+    pub probability: f64,
+    /// Share of its points where the probability is right, 0 to 1.
     pub right: f64,
 }
 
@@ -76,13 +76,13 @@ impl Default for Reliability {
 }
 
 impl Reliability {
-    /// Adds a point with a chance of 0 to 1, whether that is `right`, and an end-point error of
-    /// `error_m` metres. A lower chance counts in the first bin, a higher one in the last. The
+    /// Adds a point with a probability of 0 to 1, whether that is `right`, and an end-point error of
+    /// `error_m` metres. A lower probability counts in the first bin, a higher one in the last. The
     /// values must not be NaN, because the results that use them would be NaN.
-    pub fn add(&mut self, chance: f64, right: bool, error_m: f64) {
-        let cell = ((chance * CELLS as f64) as usize).min(CELLS - 1);
+    pub fn add(&mut self, probability: f64, right: bool, error_m: f64) {
+        let cell = ((probability * CELLS as f64) as usize).min(CELLS - 1);
         let cell = &mut self.cells[cell];
-        cell.chance += chance;
+        cell.probability += probability;
         cell.error_m += error_m;
         cell.right += f64::from(u8::from(right));
         cell.points += 1.0;
@@ -106,7 +106,7 @@ impl Reliability {
         self.add_pair(flow, covered, confidence, truth, right)
     }
 
-    /// As [`Self::add_confidence`], for N chances that the points move.
+    /// As [`Self::add_confidence`], for N probabilities that the points move.
     ///
     /// # Errors
     /// Also [`EvaluateError::Missing`] if the truth does not say which points move.
@@ -129,15 +129,15 @@ impl Reliability {
         &mut self,
         flow: &[Point],
         covered: &[bool],
-        chances: &[f32],
+        probabilities: &[f32],
         truth: &Truth,
         right: impl Fn(usize, f64) -> bool,
     ) -> Result<(), EvaluateError> {
         truth.check_lengths(flow, covered)?;
-        truth.check_length("the chance", Some(chances.len()))?;
+        truth.check_length("the probability", Some(probabilities.len()))?;
         for row in truth.scored(flow, covered) {
             let error_m = end_point_error(double(flow[row]), double(truth.flow[row]));
-            self.add(f64::from(chances[row]), right(row, error_m), error_m);
+            self.add(f64::from(probabilities[row]), right(row, error_m), error_m);
         }
         Ok(())
     }
@@ -146,7 +146,7 @@ impl Reliability {
     pub fn finish(&self) -> Option<Calibration> {
         let sum = |cells: &[Cell]| {
             cells.iter().fold(Cell::default(), |sum, cell| Cell {
-                chance: sum.chance + cell.chance,
+                probability: sum.probability + cell.probability,
                 error_m: sum.error_m + cell.error_m,
                 right: sum.right + cell.right,
                 points: sum.points + cell.points,
@@ -161,13 +161,13 @@ impl Reliability {
             .filter(|bin| bin.points > 0.0)
             .map(|bin| CalibrationBin {
                 share: bin.points / all.points,
-                chance: bin.chance / bin.points,
+                probability: bin.probability / bin.points,
                 right: bin.right / bin.points,
             })
             .collect();
         let off = bins
             .iter()
-            .map(|bin| bin.share * (bin.chance - bin.right).abs());
+            .map(|bin| bin.share * (bin.probability - bin.right).abs());
         let upper = sum(&self.cells[CELLS / 2..]);
         // The cell that contains the median counts partly in each half.
         let (mut left, mut sure_m) = (all.points / 2.0, 0.0);

@@ -1,8 +1,8 @@
-//! Two chances of a point: its confidence, which is the probability that its end-point error is
+//! Two probabilities of a point: its confidence, which is the probability that its end-point error is
 //! below [`CONFIDENT_WITHIN_M`], and the probability that it moves by at least
 //! [`crate::flow::DYNAMIC_M`].
 //!
-//! Logistic regressions on the same features, for each chance one of moving points, one of static
+//! Logistic regressions on the same features, for each probability one of moving points, one of static
 //! points and one of ground. They are fitted to labelled and simulated pairs
 //! (`benches/accuracy/confidence.rs`, `docs/experiments/confidence.md`).
 
@@ -15,7 +15,7 @@ pub const CONFIDENT_WITHIN_M: f32 = 0.05;
 /// Number of features.
 const FEATURES: usize = 13;
 
-/// Weights of the logistic regressions of one chance. Features beyond the weights are not used.
+/// Weights of the logistic regressions of one probability. Features beyond the weights are not used.
 struct Weights {
     /// Of moving points, in the order of [`ConfidenceFeatures::features`].
     moving: &'static [f32],
@@ -36,7 +36,7 @@ const WITHIN: Weights = Weights {
     ground: [5.792, -0.522],
 };
 
-/// Weights of the chance that a point moves.
+/// Weights of the probability that a point moves.
 const MOVES: Weights = Weights {
     moving: &[
         1.558, 1.855, 0.016, 0.002, -1.936, -9.556, -9.700, 0.000, 1.107, 3.667, -1.624, -6.284,
@@ -49,9 +49,9 @@ const MOVES: Weights = Weights {
     ground: [-5.792, 0.522],
 };
 
-/// The two chances of a point, 0 to 1.
+/// The two probabilities of a point, 0 to 1.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Chances {
+pub struct Probabilities {
     /// The probability that the end-point error of the point's flow is below
     /// [`CONFIDENT_WITHIN_M`].
     pub confidence: f32,
@@ -60,15 +60,15 @@ pub struct Chances {
     pub moving: f32,
 }
 
-impl Chances {
-    /// The chances of a point that was taken for ground, whose flow is the ego motion alone. It
+impl Probabilities {
+    /// The probabilities of a point that was taken for ground, whose flow is the ego motion alone. It
     /// moves if it is of an object that the segmentation of the ground took in. `range_m` is its
     /// horizontal distance from the origin of the target's frame, metres.
     pub fn of_ground(range_m: f32) -> Self {
         let features = [1.0, range(range_m)];
         Self {
-            confidence: chance(&WITHIN.ground, &features),
-            moving: chance(&MOVES.ground, &features),
+            confidence: probability(&WITHIN.ground, &features),
+            moving: probability(&MOVES.ground, &features),
         }
     }
 }
@@ -114,15 +114,15 @@ impl ConfidenceFeatures {
         ]
     }
 
-    /// The chances of the point: logistic regressions on [`Self::features`], with separate weights
+    /// The probabilities of the point: logistic regressions on [`Self::features`], with separate weights
     /// for moving and static points. The weights are fitted by `benches/accuracy/confidence.rs`; see
     /// `docs/experiments/confidence.md`.
-    pub fn chances(&self) -> Chances {
+    pub fn probabilities(&self) -> Probabilities {
         let features = self.features();
         let weights = |of: &Weights| if self.moves { of.moving } else { of.standing };
-        Chances {
-            confidence: chance(weights(&WITHIN), &features),
-            moving: chance(weights(&MOVES), &features),
+        Probabilities {
+            confidence: probability(weights(&WITHIN), &features),
+            moving: probability(weights(&MOVES), &features),
         }
     }
 }
@@ -133,7 +133,7 @@ fn range(range_m: f32) -> f32 {
 }
 
 /// Logistic function of the weighted sum of the features.
-fn chance(weights: &[f32], features: &[f32]) -> f32 {
+fn probability(weights: &[f32], features: &[f32]) -> f32 {
     let sum: f32 = weights.iter().zip(features).map(|(w, f)| w * f).sum();
     1.0 / (1.0 + (-sum).exp())
 }

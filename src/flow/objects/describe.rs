@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::confidence::Chances;
+use super::confidence::Probabilities;
 use super::features::ConfidenceFeatures;
 use super::labels::ClusterLabels;
 use super::search::ObjectSearch;
@@ -18,7 +18,7 @@ pub struct Objects {
     /// [`super::CONFIDENT_WITHIN_M`]. Zero for rows without a flow. Zero also for rows off the
     /// ground if the search was interrupted before or right after the clustering.
     pub confidence: Vec<f32>,
-    /// N chances, 0 to 1: the probability that a row's point is displaced by at least
+    /// N probabilities, 0 to 1: the probability that a row's point is displaced by at least
     /// [`DYNAMIC_M`], ego motion taken out. Zero wherever the confidence is.
     pub moving: Vec<f32>,
     /// K clusters, in descending order of their number of points.
@@ -72,10 +72,14 @@ impl Objects {
             moving: vec![0.0; count],
             clusters: Vec::new(),
         };
-        let chances = search.evidence.par_iter().map(ConfidenceFeatures::chances);
-        let chances: Vec<Chances> = chances.collect();
-        for (&row, chances) in rows.iter().zip(chances) {
-            (objects.confidence[row], objects.moving[row]) = (chances.confidence, chances.moving);
+        let probabilities = search
+            .evidence
+            .par_iter()
+            .map(ConfidenceFeatures::probabilities);
+        let probabilities: Vec<Probabilities> = probabilities.collect();
+        for (&row, probabilities) in rows.iter().zip(probabilities) {
+            (objects.confidence[row], objects.moving[row]) =
+                (probabilities.confidence, probabilities.moving);
         }
         let ClusterLabels { of, motions } = &search.parts;
         let mut members: Vec<Vec<usize>> = vec![Vec::new(); motions.len()];
@@ -89,8 +93,8 @@ impl Objects {
         }
         let described = motions.par_iter().zip(&members).map(|(&motion, members)| {
             let points: Vec<Point> = members.iter().map(|&i| points[i]).collect();
-            let mean = |chances: &[f32]| {
-                let sum: f32 = members.iter().map(|&i| chances[rows[i]]).sum();
+            let mean = |probabilities: &[f32]| {
+                let sum: f32 = members.iter().map(|&i| probabilities[rows[i]]).sum();
                 sum / members.len().max(1) as f32
             };
             let mut cluster = Cluster {
@@ -120,22 +124,26 @@ impl Objects {
         objects
     }
 
-    /// Multiplies the confidences and the chances of motion of rows and clusters by `factor`, 0 to
+    /// Multiplies the confidences and the probabilities of motion of rows and clusters by `factor`, 0 to
     /// 1.
-    pub(crate) fn scale_chances(&mut self, factor: f32) {
+    pub(crate) fn scale_probabilities(&mut self, factor: f32) {
         let clusters = self.clusters.iter_mut();
         let of_clusters = clusters.flat_map(|of| [&mut of.confidence, &mut of.moving]);
         let of_rows = self.confidence.iter_mut().chain(&mut self.moving);
-        for chance in of_rows.chain(of_clusters) {
-            *chance *= factor;
+        for probability in of_rows.chain(of_clusters) {
+            *probability *= factor;
         }
     }
 
-    /// Sets the confidence and the chance of motion of rows without a flow to zero.
+    /// Sets the confidence and the probability of motion of rows without a flow to zero.
     pub(crate) fn clear_invalid(&mut self, valid: &[bool]) {
-        for chances in [&mut self.confidence, &mut self.moving] {
-            for (chance, _) in chances.iter_mut().zip(valid).filter(|&(_, valid)| !valid) {
-                *chance = 0.0;
+        for probabilities in [&mut self.confidence, &mut self.moving] {
+            for (probability, _) in probabilities
+                .iter_mut()
+                .zip(valid)
+                .filter(|&(_, valid)| !valid)
+            {
+                *probability = 0.0;
             }
         }
     }
@@ -216,8 +224,8 @@ mod tests {
         }
         let mean = |dynamic: bool| {
             let clusters = objects.clusters.iter().filter(|c| c.dynamic == dynamic);
-            let chances: Vec<f32> = clusters.map(|cluster| cluster.moving).collect();
-            chances.iter().sum::<f32>() / chances.len() as f32
+            let probabilities: Vec<f32> = clusters.map(|cluster| cluster.moving).collect();
+            probabilities.iter().sum::<f32>() / probabilities.len() as f32
         };
         let (moves, stands) = (mean(true), mean(false));
         assert!(moves > 0.5 && stands < 0.1, "{moves} {stands}");

@@ -36,7 +36,7 @@ mod search;
 #[cfg(test)]
 mod tests;
 
-pub use confidence::{CONFIDENT_WITHIN_M, Chances};
+pub use confidence::{CONFIDENT_WITHIN_M, Probabilities};
 pub use describe::{Cluster, Objects};
 pub use features::ConfidenceFeatures;
 pub use labels::ClusterLabels;

@@ -23,7 +23,7 @@ const LEAST_WAY_M: f32 = 0.3;
 const WAY_DIFFERENCE: f32 = 0.5;
 /// Least height of a track, metres. Flatter objects are rings on the ground that an object hides.
 const LEAST_HEIGHT_M: f32 = 0.3;
-/// Least chance that a cluster moves.
+/// Least probability that a cluster moves.
 const LEAST_MOVING: f32 = 0.5;
 /// Share of the predicted way that an object must come by to have moved unnoticed.
 const UNNOTICED: f32 = 0.5;

@@ -9,7 +9,7 @@ use super::objects::Described;
 use super::table::{FlowFile, FlowTable};
 use crate::flow::{Cluster, Point};
 use crate::formats::error::{FileKind, FormatError};
-use crate::formats::limits::{check_chance, check_value};
+use crate::formats::limits::{check_probability, check_value};
 use crate::formats::motion::{ego_motion, matrix_rows};
 
 const KIND: FileKind = FileKind::Json;
@@ -55,21 +55,21 @@ pub(super) fn read(bytes: &[u8]) -> Result<FlowFile, FormatError> {
             check_value(KIND, row, "flow.z", z)?,
         ]);
     }
-    let chances = |name: &str, chances: Option<Vec<f64>>| {
-        let rows = |chances: Vec<f64>| -> Result<Vec<f32>, FormatError> {
-            let rows = chances.into_iter().enumerate();
-            rows.map(|(row, chance)| check_chance(KIND, row, name, chance))
+    let probabilities = |name: &str, probabilities: Option<Vec<f64>>| {
+        let rows = |probabilities: Vec<f64>| -> Result<Vec<f32>, FormatError> {
+            let rows = probabilities.into_iter().enumerate();
+            rows.map(|(row, probability)| check_probability(KIND, row, name, probability))
                 .collect()
         };
-        chances.map(rows).transpose()
+        probabilities.map(rows).transpose()
     };
     Ok(FlowFile {
         flow,
         valid: read.valid,
         dynamic: read.dynamic,
         cluster: read.cluster,
-        confidence: chances("confidence", read.confidence)?,
-        moving: chances("moving", read.moving)?,
+        confidence: probabilities("confidence", read.confidence)?,
+        moving: probabilities("moving", read.moving)?,
         clusters: read.clusters.map(clusters).transpose()?,
         ego: read.ego.as_ref().map(ego_motion).transpose()?,
     })

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::flow::{Cluster, Objects, OrientedBox, Point};
 use crate::formats::error::{FileKind, FormatError};
-use crate::formats::limits::{check_chance, check_flag, check_id, check_value};
+use crate::formats::limits::{check_flag, check_id, check_probability, check_value};
 use crate::formats::npy;
 use crate::formats::npz::{Npz, NpzWriter};
 use crate::formats::pair::check_count;
@@ -77,8 +77,8 @@ pub(super) fn take(npz: &mut Npz<'_>) -> Result<Option<Vec<Cluster>>, FormatErro
         };
     let yaws = values("clusters_yaw", check_value)?;
     let yaw_rates = values("clusters_yaw_rate", check_value)?;
-    let confidence = values("clusters_confidence", check_chance)?;
-    let moving = values("clusters_moving", check_chance)?;
+    let confidence = values("clusters_confidence", check_probability)?;
+    let moving = values("clusters_moving", check_probability)?;
     let clusters = (0..count).map(|row| Cluster {
         points: counts[row],
         dynamic: dynamic[row],
@@ -134,8 +134,8 @@ impl Described {
         for &value in values {
             check_value(kind, row, "clusters", f64::from(value))?;
         }
-        check_chance(kind, row, "clusters.confidence", f64::from(self.confidence))?;
-        check_chance(kind, row, "clusters.moving", f64::from(self.moving))?;
+        check_probability(kind, row, "clusters.confidence", f64::from(self.confidence))?;
+        check_probability(kind, row, "clusters.moving", f64::from(self.moving))?;
         Ok(Cluster {
             points: self.points,
             dynamic: self.dynamic,

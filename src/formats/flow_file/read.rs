@@ -6,7 +6,7 @@ use super::{json, objects};
 use crate::formats::cloud::read_columns;
 use crate::formats::error::{FileKind, FormatError};
 use crate::formats::feather::{FLOW_COLUMNS, Table};
-use crate::formats::limits::{MAX_POINTS, check_chance, check_flag, check_id, check_value};
+use crate::formats::limits::{MAX_POINTS, check_flag, check_id, check_probability, check_value};
 use crate::formats::motion::ego_motion;
 use crate::formats::npy;
 use crate::formats::npz::Npz;
@@ -24,7 +24,7 @@ use crate::formats::sniff::recognize;
 /// - `Unrecognized` and `Ambiguous` as for [`recognize`].
 /// - `Malformed` for a file that violates its format or is truncated. Also for a cluster index that
 ///   is not a whole number of 32 bits or not below the number of clusters, and for a
-///   confidence or a chance of motion outside of 0 to 1.
+///   confidence or a probability of motion outside of 0 to 1.
 /// - `Unsupported` for raw floats, which hold a cloud, and for arrays or columns of another type or
 ///   shape.
 /// - `Missing` where the flow, or the center, size or velocity of the clusters, is missing.
@@ -47,11 +47,11 @@ pub fn read_flow(bytes: &[u8], name: Option<&str>) -> Result<FlowFile, FormatErr
                 valid: npz.mask("valid")?,
                 dynamic: npz.mask("dynamic")?,
                 cluster: npz.column("cluster", |row, id| check_id(kind, row, "cluster", id))?,
-                confidence: npz.column("confidence", |row, chance| {
-                    check_chance(kind, row, "confidence", chance)
+                confidence: npz.column("confidence", |row, probability| {
+                    check_probability(kind, row, "confidence", probability)
                 })?,
-                moving: npz.column("moving", |row, chance| {
-                    check_chance(kind, row, "moving", chance)
+                moving: npz.column("moving", |row, probability| {
+                    check_probability(kind, row, "moving", probability)
                 })?,
                 clusters: objects::take(&mut npz)?,
                 ego: npz.matrix("ego")?.as_ref().map(ego_motion).transpose()?,
@@ -64,11 +64,11 @@ pub fn read_flow(bytes: &[u8], name: Option<&str>) -> Result<FlowFile, FormatErr
                 valid: flags(&table, &["is_valid", "valid"])?,
                 dynamic: flags(&table, &["is_dynamic", "dynamic"])?,
                 cluster: table.column("cluster", |row, id| check_id(kind, row, "cluster", id))?,
-                confidence: table.column("confidence", |row, chance| {
-                    check_chance(kind, row, "confidence", chance)
+                confidence: table.column("confidence", |row, probability| {
+                    check_probability(kind, row, "confidence", probability)
                 })?,
-                moving: table.column("moving", |row, chance| {
-                    check_chance(kind, row, "moving", chance)
+                moving: table.column("moving", |row, probability| {
+                    check_probability(kind, row, "moving", probability)
                 })?,
                 ..FlowFile::default()
             }
@@ -171,10 +171,10 @@ impl Rows {
                 cluster.push(check_id(kind, row, "cluster", next())?);
             }
             if let Some(confidence) = &mut file.confidence {
-                confidence.push(check_chance(kind, row, "confidence", next())?);
+                confidence.push(check_probability(kind, row, "confidence", next())?);
             }
             if let Some(moving) = &mut file.moving {
-                moving.push(check_chance(kind, row, "moving", next())?);
+                moving.push(check_probability(kind, row, "moving", next())?);
             }
             Ok(())
         })?;

@@ -18,7 +18,7 @@ pub struct FlowTable<'a> {
     pub valid: &'a [bool],
     /// N flags: whether the point moves relative to the static world, where known.
     pub dynamic: Option<&'a [bool]>,
-    /// The clusters of the N points, the confidence of their flow and the chance that they move,
+    /// The clusters of the N points, the confidence of their flow and the probability that they move,
     /// where known.
     pub objects: Option<&'a Objects>,
     /// The ego motion `target_from_source`, where known.

@@ -106,7 +106,7 @@ impl FlowFormat {
 
 /// Writes a flow of N rows.
 ///
-/// The source points are not checked: they may be NaN. The clusters and chances are not checked
+/// The source points are not checked: they may be NaN. The clusters and probabilities are not checked
 /// either, and must be finite to be read back.
 ///
 /// # Errors
@@ -170,12 +170,12 @@ fn write_feather(table: &FlowTable<'_>, out: &mut dyn Write) -> Result<(), Forma
     }
     if let Some(objects) = table.objects {
         columns.push(("cluster", Values::Ids(&objects.cluster)));
-        for (name, chances) in [
+        for (name, probabilities) in [
             ("confidence", &objects.confidence),
             ("moving", &objects.moving),
         ] {
-            let chances = chances.iter().copied();
-            columns.push((name, Values::Floats(Box::new(chances))));
+            let probabilities = probabilities.iter().copied();
+            columns.push((name, Values::Floats(Box::new(probabilities))));
         }
     }
     feather::write(out, columns)
@@ -236,7 +236,7 @@ fn write_pcd(table: &FlowTable<'_>, out: &mut dyn Write) -> Result<(), FormatErr
     write_rows(table, out, |color, row| row.extend(pcd::rgb(color)))
 }
 
-/// Writes rows of point, displacement, flags, cluster, chances and color, little endian.
+/// Writes rows of point, displacement, flags, cluster, probabilities and color, little endian.
 fn write_rows(
     table: &FlowTable<'_>,
     out: &mut dyn Write,

@@ -38,7 +38,7 @@ class ServerError(Error):
     """The server refused a call, or could not be reached.
 
     Attributes:
-        code: the server's own stable code, such as `unauthenticated` or `queue_full`; None where no server answered.
+        code: the server's own stable code, such as `unauthenticated` or `server_full`; None where no server answered.
         status: gRPC's code, such as `UNAVAILABLE`.
         retry_after: seconds after which to try again, where waiting helps.
     """
