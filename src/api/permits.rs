@@ -19,10 +19,11 @@ pub(super) struct FairQueue {
 }
 
 impl FairQueue {
-    /// `turns` permits. Each tenant may have up to `turns` requests in the shared line.
-    pub(super) fn new(turns: usize) -> Self {
+    /// `turns` permits. Each tenant may have up to `each` requests that hold one or are in the shared
+    /// line. Where a permit is held for long, that is fewer than there are permits.
+    pub(super) fn new(turns: usize, each: usize) -> Self {
         Self {
-            each: turns,
+            each,
             all: Arc::new(Semaphore::new(turns)),
             own: Mutex::default(),
         }
@@ -112,7 +113,7 @@ mod tests {
     #[tokio::test]
     async fn nobody_waits_for_all_that_another_tenant_has_asked_for() {
         let tenant = |name: &str| name.parse::<Tenant>().expect("a good name");
-        let line = Arc::new(FairQueue::new(1));
+        let line = Arc::new(FairQueue::new(1, 1));
         let first = line.wait(&tenant("many")).await;
         let done = Arc::new(Mutex::new(Vec::new()));
         let mut waiting = tokio::task::JoinSet::new();
@@ -129,6 +130,21 @@ mod tests {
         let done = done.lock().expect("no panic").clone();
         let index = done.iter().position(|name| *name == "few");
         assert!(index.is_some_and(|index| index <= 1), "{done:?}");
+    }
+
+    #[tokio::test]
+    async fn a_tenant_that_holds_its_permits_for_long_leaves_some_to_others() {
+        let tenant = |name: &str| name.parse::<Tenant>().expect("a good name");
+        let line = FairQueue::new(4, 2);
+        let _held = [
+            line.wait(&tenant("many")).await,
+            line.wait(&tenant("many")).await,
+        ];
+        let soon = Duration::from_millis(20);
+        let more = tokio::time::timeout(soon, line.wait(&tenant("many"))).await;
+        assert!(more.is_err());
+        let other = tokio::time::timeout(Duration::from_secs(20), line.wait(&tenant("few"))).await;
+        assert!(other.expect("at once").is_some());
     }
 
     #[test]

@@ -125,11 +125,18 @@ impl Service {
             remotes: parts.remotes,
             store_health: parts.store_health,
             limits: parts.limits,
-            compute: FairQueue::new(cores),
-            encoding: FairQueue::new(cores),
+            compute: FairQueue::new(cores, cores),
+            encoding: FairQueue::new(cores, cores),
             archives: Arc::new(TenantPermits::new(MAX_ARCHIVES, several)),
             clouds: Arc::new(Semaphore::new(1)),
-            fetches: FairQueue::new(MAX_FETCHES),
+            fetches: FairQueue::new(
+                MAX_FETCHES,
+                if several {
+                    MAX_FETCHES / 2
+                } else {
+                    MAX_FETCHES
+                },
+            ),
             ready: watch::Sender::new(false),
             draining: AtomicBool::new(false),
             closing: CancellationToken::new(),
@@ -386,6 +393,15 @@ impl Service {
     ///   queue fails or is closed.
     pub async fn wait(&self, id: JobId, longest: Option<Duration>) -> Result<Waited, ApiError> {
         let mut news = self.queue.watch(id).await?;
+        self.wait_for_end(&mut news, longest).await
+    }
+
+    /// [`Service::wait`] by somebody who has subscribed to the job.
+    pub(super) async fn wait_for_end(
+        &self,
+        news: &mut watch::Receiver<Arc<Job>>,
+        longest: Option<Duration>,
+    ) -> Result<Waited, ApiError> {
         let longest = longest.unwrap_or(Duration::MAX);
         let ended = news.wait_for(|job| job.state.is_end());
         tokio::select! {

@@ -1,5 +1,6 @@
 //! The queue over a database: the same for every [`Engine`], which runs its transactions.
 
+use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -198,15 +199,23 @@ impl<E: Engine> Queue for DatabaseQueue<E> {
         .await
     }
 
+    async fn keep(&self, id: JobId) -> Result<Duration, QueueError> {
+        self.change(Kept::Soon, move |sql, _, options| {
+            expiry::keep(sql, options, id)?;
+            Ok(options.answered_retention)
+        })
+        .await
+    }
+
     async fn watch(&self, id: JobId) -> Result<watch::Receiver<Arc<Job>>, QueueError> {
         self.engine.watch(id).await
     }
 
-    async fn lease_while(
+    async fn lease_until(
         &self,
         worker: &str,
         kind: DeviceKind,
-        wanted: &(dyn Fn() -> bool + Sync),
+        mut until: Pin<&mut (dyn Future<Output = ()> + Send)>,
     ) -> Result<Option<Lease>, QueueError> {
         let worker: Arc<str> = Arc::from(worker);
         loop {
@@ -217,23 +226,30 @@ impl<E: Engine> Queue for DatabaseQueue<E> {
             let claim = self.change(Kept::Soon, move |sql, effects, options| {
                 leases::claim(sql, effects, options, &name, kind)
             });
-            match local.look(kind, wanted, claim).await? {
+            match local.look(kind, until.as_mut(), claim).await? {
                 Look::Found(job) => {
                     let flags = local.flags_of(&job);
                     let store = self.engine.heartbeat(&job);
                     let heartbeat = LeaseHeartbeat::new(flags, store);
                     return Ok(Some(Lease { job, heartbeat }));
                 }
-                Look::NotWanted => return Ok(None),
+                Look::GivenUp => return Ok(None),
                 Look::Empty => {}
             }
-            match self.engine.poll_interval() {
-                None => woken.await,
-                Some(interval) => {
-                    if tokio::time::timeout(interval, woken).await.is_err() {
-                        local.look_again(interval);
+            let change = async {
+                match self.engine.poll_interval() {
+                    None => woken.await,
+                    Some(interval) => {
+                        if tokio::time::timeout(interval, woken).await.is_err() {
+                            local.look_again(interval);
+                        }
                     }
                 }
+            };
+            tokio::select! {
+                biased;
+                () = until.as_mut() => return Ok(None),
+                () = change => {}
             }
         }
     }

@@ -1,5 +1,6 @@
 //! The interface of the queue: the `Queue` trait.
 
+use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -111,6 +112,16 @@ pub trait Queue: Send + Sync {
     /// the store.
     async fn remove(&self, id: JobId) -> Result<(), QueueError>;
 
+    /// Begins the retention of an ended ephemeral job anew, because somebody still waits to read its
+    /// result. Returns that retention ([`QueueOptions::answered_retention`]). Other jobs stay as they
+    /// are.
+    ///
+    /// [`QueueOptions::answered_retention`]: super::QueueOptions::answered_retention
+    ///
+    /// # Errors
+    /// [`QueueError::NotFound`] if there is no such job, or an error of the store.
+    async fn keep(&self, id: JobId) -> Result<Duration, QueueError>;
+
     /// Subscribes to a job: its state and, while it runs, its progress. The channel keeps only the
     /// latest value, so a slow receiver misses values in between. It closes when the job has ended.
     /// The last value can still be read then.
@@ -122,28 +133,29 @@ pub trait Queue: Send + Sync {
     /// Waits for the next job that a device of this kind may run, and leases it to `worker`, a name
     /// that is stored with the job. Jobs that require the other kind are skipped.
     ///
-    /// `wanted` is asked before each claim, when a job may have become ready. If it says no, nothing
-    /// is claimed and the result is `None`.
+    /// The wait ends with `None` when `until` is ready. It is polled before each claim, and a claim
+    /// that has begun is completed. So no job is lost between the queue and a worker that leaves.
     ///
     /// If the future is dropped, the lease may already exist. The job is then queued again when the
     /// lease expires.
     ///
     /// # Errors
     /// An error of the store.
-    async fn lease_while(
+    async fn lease_until(
         &self,
         worker: &str,
         kind: DeviceKind,
-        wanted: &(dyn Fn() -> bool + Sync),
+        until: Pin<&mut (dyn Future<Output = ()> + Send)>,
     ) -> Result<Option<Lease>, QueueError>;
 
-    /// [`Queue::lease_while`] by a worker that wants a job in any case.
+    /// [`Queue::lease_until`] by a worker that waits for as long as it takes.
     ///
     /// # Errors
     /// An error of the store.
     async fn lease(&self, worker: &str, kind: DeviceKind) -> Result<Lease, QueueError> {
         loop {
-            if let Some(lease) = self.lease_while(worker, kind, &|| true).await? {
+            let forever = std::pin::pin!(std::future::pending());
+            if let Some(lease) = self.lease_until(worker, kind, forever).await? {
                 return Ok(lease);
             }
         }

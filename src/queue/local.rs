@@ -1,6 +1,7 @@
 //! What this process knows of the queue: subscriptions, the backlog, and the jobs its workers hold.
 
 use std::collections::HashMap;
+use std::pin::Pin;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -48,8 +49,8 @@ pub(super) enum Look<T> {
     Found(T),
     /// No job is ready.
     Empty,
-    /// The worker does not want a job any more. Nothing was claimed.
-    NotWanted,
+    /// The worker has left. Nothing was claimed.
+    GivenUp,
 }
 
 /// A job that a worker of this process holds.
@@ -175,20 +176,21 @@ impl Local {
         }
     }
 
-    /// Looks for a job with `claim`, unless `wanted` says no or another worker of this kind has just
+    /// Looks for a job with `claim`, unless `until` is ready or another worker of this kind has just
     /// found none. The workers of a kind look one after the other, so that many idle ones cost as
     /// much as one.
     pub(super) async fn look<T, E>(
         &self,
         kind: DeviceKind,
-        wanted: &(dyn Fn() -> bool + Sync),
+        until: Pin<&mut (dyn Future<Output = ()> + Send)>,
         claim: impl Future<Output = Result<Option<T>, E>>,
     ) -> Result<Look<T>, E> {
         let last = &self.looks[kind as usize];
-        let _turn = last.turn.lock().await;
-        if !wanted() {
-            return Ok(Look::NotWanted);
-        }
+        let _turn = tokio::select! {
+            biased;
+            () = until => return Ok(Look::GivenUp),
+            turn = last.turn.lock() => turn,
+        };
         let changes = self.changes.load(Ordering::Relaxed);
         if last.empty_at.load(Ordering::Relaxed) == changes {
             return Ok(Look::Empty);

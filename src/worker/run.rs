@@ -111,20 +111,12 @@ impl Worker {
                 () = self.drain.stop.cancelled() => break,
                 inside = self.isolation.enter() => inside,
             };
-            let wanted = || self.wants_a_job();
-            let device = self.lane.device().name();
-            let mut asking = self.queue.lease_while(device, self.lane.kind(), &wanted);
-            let lease = tokio::select! {
-                biased;
-                () = self.drain.stop.cancelled() => {
-                    self.give_back(asking).await;
-                    break;
-                }
-                lease = &mut asking => lease,
-                () = inside.is_to_leave() => {
-                    self.give_back(asking).await;
-                    continue;
-                }
+            let device = self.lane.device();
+            let lease = {
+                let until = std::pin::pin!(self.cannot_run_a_job(&inside));
+                self.queue
+                    .lease_until(device.name(), device.kind(), until)
+                    .await
             };
             match lease {
                 Ok(None) => {}
@@ -170,6 +162,10 @@ impl Worker {
     /// Isolates a suspect job, so that another crash affects only this job. Returns the end of the
     /// attempt if the job cannot start now.
     async fn apart(&self, lease: &Lease, inside: &mut IsolationGuard) -> Option<Attempt> {
+        if self.drain.stop.is_cancelled() {
+            // The claim had begun before the shutdown.
+            return Some(Attempt::Ended(Outcome::Released));
+        }
         if !is_suspect(&lease.job) {
             return None;
         }
@@ -203,22 +199,16 @@ impl Worker {
         None
     }
 
-    /// Releases a job that may have been leased during a shutdown, or while the worker had to
-    /// leave.
-    async fn give_back(&self, asking: impl Future<Output = Result<Option<Lease>, QueueError>>) {
-        const MOMENT: Duration = Duration::from_millis(100);
-        if let Ok(Ok(Some(lease))) = tokio::time::timeout(MOMENT, asking).await
-            && let Err(error) = alive(&lease, self.finish(&lease, Outcome::Released)).await
-        {
-            tracing::warn!(%error, job = %lease.job.id, "a job was not given back");
+    /// Returns when the worker has to stop or to leave, or its device is not ready. The job of a
+    /// device that was lost is queued again while the device is being reopened, and another lane of
+    /// that device must not claim it.
+    async fn cannot_run_a_job(&self, inside: &IsolationGuard) {
+        let mut health = self.lane.device().health();
+        tokio::select! {
+            () = self.drain.stop.cancelled() => {}
+            () = inside.is_to_leave() => {}
+            _ended_is_the_same = health.wait_for(|health| *health != Health::Ready) => {}
         }
-    }
-
-    /// Whether the worker can run a job now: its device is ready and no shutdown has begun. The job
-    /// of a device that was lost is queued again while the device is being reopened, and another
-    /// lane of that device must not claim it.
-    fn wants_a_job(&self) -> bool {
-        !self.drain.stop.is_cancelled() && *self.lane.device().health().borrow() == Health::Ready
     }
 
     /// Waits until the device is ready; false if the worker has to stop.
@@ -241,7 +231,7 @@ impl Worker {
         let began = Instant::now();
         let solved = self.lane.estimate(work).await;
         let took = began.elapsed();
-        let _its_own_errors_are_logged = keeper.await;
+        let _its_own_errors_are_logged = alive(lease, keeper).await;
         if let Err(
             EngineError::Broken(_) | EngineError::Flow(FlowError::Backend(BackendError::Busy)),
         ) = solved

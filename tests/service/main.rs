@@ -47,6 +47,7 @@ mod removal;
 mod retries;
 mod sequences;
 mod server;
+mod slow_readers;
 mod sources;
 mod store_trouble;
 mod tracks;

@@ -28,6 +28,9 @@ use crate::payload::StoredCloud;
 /// Number of response messages that are buffered for a slow client.
 const AHEAD: usize = 4;
 
+/// Minimum period of progress messages.
+const LEAST_PAUSE: Duration = Duration::from_millis(20);
+
 /// The implementation of the gRPC service.
 pub(super) struct Calls {
     service: Arc<Service>,
@@ -59,7 +62,10 @@ impl Calls {
             Some(Part::Begin(begin)) => begin,
             _ => return Err(no_begin()),
         };
-        let pause = u64::from(begin.progress_ms);
+        let pause = match u64::from(begin.progress_ms) {
+            0 => None,
+            pause => Some(Duration::from_millis(pause).max(LEAST_PAUSE)),
+        };
         let options = requests::options(begin.options)?;
         options.check_for_pairs().map_err(ApiError::from)?;
         self.service
@@ -86,7 +92,7 @@ impl Calls {
             pending.push(cloud.finish(part)?, None).await?;
         }
         let accepted = pending.submit(Kind::Pair).await?;
-        Ok((accepted, (pause > 0).then(|| Duration::from_millis(pause))))
+        Ok((accepted, pause))
     }
 }
 
@@ -127,8 +133,9 @@ async fn send_flow(
         answers.send(Ok(message)).await.is_ok()
     };
     let mut sent = None;
+    let mut news = service.queue.watch(id).await?;
     let job = loop {
-        match service.wait(id, pause).await? {
+        match service.wait_for_end(&mut news, pause).await? {
             Waited::Ended(job) => break job,
             Waited::StillOpen(_) if service.closing.is_cancelled() => {
                 return Err(ApiError::Draining);

@@ -17,6 +17,7 @@ use super::{chunks, convert, proto, requests};
 use crate::api::admission::Durability;
 use crate::api::error::ApiError;
 use crate::api::job_request::ChainLink;
+use crate::api::kept_result::KeptResult;
 use crate::api::pending_job::{Accepted, PendingJob};
 use crate::api::service::{Service, Waited};
 use crate::api::sweep_order::SweepOrder;
@@ -39,6 +40,8 @@ struct Pending {
     target: String,
     /// The job, or the error of its submission.
     job: Result<Accepted, ApiError>,
+    /// The client may read the pairs before it slowly.
+    kept: Option<KeptResult>,
 }
 
 /// A message from the reader task to the writer task, in order.
@@ -111,7 +114,8 @@ pub(super) fn run(
         if let Err(error) = reader.run().await {
             // The error follows the pairs of the complete sweeps, so that their flows are still
             // sent.
-            reader.submit_rest().await;
+            let _its_first_error_counts = reader.submit_rest().await;
+            drop(reader);
             let _gone_is_fine = pending.send(Item::Broken(error)).await;
         }
     });
@@ -158,8 +162,8 @@ impl Reader {
                 // A sweep that is known to be incomplete must continue to arrive.
                 room.wait(self.inbound.message()).await?
             } else {
-                let held: u64 = self.held.iter().map(|sweep| sweep.room.bytes()).sum();
-                room.pause(held, self.inbound.message()).await?
+                room.pause(self.held_bytes(), self.inbound.message())
+                    .await?
             };
             let message = message.map_err(|status| {
                 ApiError::BadRequest(format!("the stream is broken: {}", status.message()))
@@ -193,8 +197,7 @@ impl Reader {
                 self.take(whole, room.next()).await?;
             }
             if ended {
-                self.submit_rest().await;
-                return Ok(());
+                return self.submit_rest().await;
             }
         }
     }
@@ -206,7 +209,7 @@ impl Reader {
         self.count += 1;
         let sweeps = self.options.sweeps();
         while self.index + 1 < self.count && is_window_final(self.index, self.count, sweeps) {
-            self.submit_next().await;
+            self.submit_next().await?;
         }
         let first = window(self.index, self.count.max(self.index + 2), sweeps).start;
         while self.count - self.held.len() < first {
@@ -217,30 +220,45 @@ impl Reader {
 
     /// At the end of the stream: submits the remaining pairs, with windows that end at the last
     /// sweep.
-    async fn submit_rest(&mut self) {
+    async fn submit_rest(&mut self) -> Result<(), ApiError> {
         while self.index + 1 < self.count {
-            self.submit_next().await;
+            self.submit_next().await?;
         }
+        Ok(())
     }
 
-    /// Submits the next pair with the sweeps of its window.
-    async fn submit_next(&mut self) {
+    /// Submits the next pair with the sweeps of its window. It waits for a client that has to read the
+    /// pairs before, until other requests need the memory of the sweeps.
+    async fn submit_next(&mut self) -> Result<(), ApiError> {
         let index = self.index;
         self.index += 1;
-        let Ok(place_in_line) = self.pending.clone().reserve_owned().await else {
-            return;
+        let place = self.pending.clone().reserve_owned();
+        let place = match self.held.back() {
+            Some(latest) => latest.room.pause(self.held_bytes(), place).await?,
+            None => place.await,
+        };
+        let Ok(place_in_line) = place else {
+            return Ok(());
         };
         let first_held = self.count - self.held.len();
         let name = |index: usize| self.held[index - first_held].name.clone();
         let names = (name(index), name(index + 1));
         let job = self.submit(index).await;
         self.before = job.as_ref().ok().map(|accepted| accepted.job.id);
+        let kept = self.before.map(|id| KeptResult::of(&self.service, id));
         let _sender = place_in_line.send(Item::Pair(Pending {
             index: u32::try_from(index).unwrap_or(u32::MAX),
             source: names.0,
             target: names.1,
             job,
+            kept,
         }));
+        Ok(())
+    }
+
+    /// Bytes of the sweeps that further pairs need.
+    fn held_bytes(&self) -> u64 {
+        self.held.iter().map(|sweep| sweep.room.bytes()).sum()
     }
 
     async fn submit(&mut self, index: usize) -> Result<Accepted, ApiError> {
@@ -299,6 +317,7 @@ async fn send(service: &Arc<Service>, pair: Pending, answers: &ResultBudget) -> 
         target: pair.target.clone(),
         outcome: Some(outcome),
     };
+    let kept = pair.kept;
     let answer = match pair.job {
         Err(error) => Err(error),
         Ok(accepted) => match service.wait(accepted.job.id, None).await {
@@ -312,6 +331,7 @@ async fn send(service: &Arc<Service>, pair: Pending, answers: &ResultBudget) -> 
             Err(error) => Err(error),
         },
     };
+    drop(kept);
     match answer {
         Err(error) => {
             service.count_late_error("grpc", &error);
@@ -319,26 +339,29 @@ async fn send(service: &Arc<Service>, pair: Pending, answers: &ResultBudget) -> 
             answers.send(message(Part::Pair(failed))).await.is_ok()
         }
         Ok(answer) => {
-            let head = header(Outcome::Header(Box::new(convert::header(&answer))));
-            if answers.send(message(Part::Pair(head))).await.is_err() {
-                return false;
-            }
-            for piece in chunks::pieces(&answer, 0) {
-                let length = piece.flow.len();
-                tokio::select! {
-                    sent = answers.send(message(Part::Chunk(piece))) => if sent.is_err() {
-                        return false;
-                    },
-                    () = answer.room.taking().evicted() => {
-                        let error = ApiError::TakenTooSlowly;
-                        service.count_late_error("grpc", &error);
-                        let _gone_is_fine = answers.try_send(Err(error.into()));
+            let sending = async {
+                let head = header(Outcome::Header(Box::new(convert::header(&answer))));
+                if answers.send(message(Part::Pair(head))).await.is_err() {
+                    return false;
+                }
+                for piece in chunks::pieces(&answer, 0) {
+                    let length = piece.flow.len();
+                    if answers.send(message(Part::Chunk(piece))).await.is_err() {
                         return false;
                     }
+                    answer.room.taking().took(length);
                 }
-                answer.room.taking().took(length);
+                true
+            };
+            tokio::select! {
+                sent = sending => sent,
+                () = answer.room.taking().evicted() => {
+                    let error = ApiError::TakenTooSlowly;
+                    service.count_late_error("grpc", &error);
+                    let _gone_is_fine = answers.try_send(Err(error.into()));
+                    false
+                }
             }
-            true
         }
     }
 }

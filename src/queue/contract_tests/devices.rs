@@ -1,6 +1,6 @@
 //! Device requirements: which device kind runs a job, and jobs whose device is lost or too small.
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use tokio_util::sync::CancellationToken;
 
 use super::*;
 
@@ -51,15 +51,16 @@ pub(crate) async fn jobs_that_wait_for_one_kind_hold_up_no_other(stand: &mut imp
     assert_eq!((ahead(Some(DeviceKind::Cpu)), ahead(None)), (0.0, 0.0));
 }
 
-pub(crate) async fn a_worker_that_wants_no_job_any_more_claims_none(stand: &mut impl Stand) {
+pub(crate) async fn a_worker_that_leaves_claims_nothing(stand: &mut impl Stand) {
     let (queue, _events) = stand.open(QueueOptions::default()).await;
-    let wants = AtomicBool::new(true);
-    let wanted = || wants.load(Ordering::Relaxed);
-    let mut asking = queue.lease_while("worker", DeviceKind::Cpu, &wanted);
+    let leave = CancellationToken::new();
+    let until = std::pin::pin!(leave.cancelled());
+    let mut asking = queue.lease_until("worker", DeviceKind::Cpu, until);
     let soon = timeout(Duration::from_millis(50), &mut asking).await;
     assert!(soon.is_err(), "no job is ready");
-    wants.store(false, Ordering::Relaxed);
+    // Both happen before the worker looks again.
     let job = submit(&queue, submission("a")).await;
+    leave.cancel();
     let asked = timeout(PATIENCE, asking).await.expect("in time");
     assert!(asked.expect("the store works").is_none());
     let held = lease(&queue).await;

@@ -9,6 +9,7 @@ mod failures;
 mod fairness;
 mod lifecycle;
 mod outbox;
+mod retention;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -70,12 +71,14 @@ macro_rules! queue_contract {
             a_sequence_is_cancelled_with_its_pairs_and_can_be_asked_for_again,
             ended_jobs_are_kept_for_a_while_and_then_forgotten,
             an_ended_job_is_removed_when_its_owner_asks_for_it,
+            a_result_that_somebody_waits_to_read_is_kept,
+            a_pair_is_not_done_again_while_its_sequence_is_being_closed,
             a_sequence_that_is_asked_for_again_repeats_what_a_deadline_stopped_early,
             followers_see_every_state,
             lists_are_latest_first_in_pages_and_of_one_tenant,
             a_job_goes_only_to_the_kind_of_device_that_it_needs,
             jobs_that_wait_for_one_kind_hold_up_no_other,
-            a_worker_that_wants_no_job_any_more_claims_none,
+            a_worker_that_leaves_claims_nothing,
             a_job_that_moves_waits_for_the_other_kind_without_blame,
             a_device_that_dies_under_a_job_again_and_again_ends_it,
             jobs_for_a_kind_survive_a_crash,
@@ -96,6 +99,7 @@ macro_rules! queue_contract {
             a_result_is_delivered_before_the_end_of_its_job_is_told,
             each_forward_pair_of_a_sequence_is_delivered_and_then_its_end_is_told,
             nothing_is_delivered_of_a_job_that_was_removed_or_is_done_again,
+            notices_that_wait_for_a_delivery_hold_up_no_other,
         }
     };
     ($stand:expr; $($name:ident,)*) => {
@@ -114,6 +118,7 @@ pub(crate) use super::contract_tests::failures::*;
 pub(crate) use super::contract_tests::fairness::*;
 pub(crate) use super::contract_tests::lifecycle::*;
 pub(crate) use super::contract_tests::outbox::*;
+pub(crate) use super::contract_tests::retention::*;
 pub(crate) use queue_contract;
 
 fn tenant(name: &str) -> Tenant {

@@ -252,3 +252,30 @@ fn delivery(job: &Job) -> Option<(&str, DeliveryState)> {
     let delivery = job.delivery.as_ref()?;
     Some((&delivery.uri, delivery.state))
 }
+
+pub(crate) async fn notices_that_wait_for_a_delivery_hold_up_no_other(stand: &mut impl Stand) {
+    let (queue, _events) = stand.open(QueueOptions::default()).await;
+    for number in 0..25 {
+        let delivered = Submission {
+            result_uri: Some(format!("s3://away/{number}.npz")),
+            ..told("a", "https://a.example/x")
+        };
+        submit(&queue, delivered).await;
+        let held = lease(&queue).await;
+        finish(&queue, &held.job, done()).await;
+    }
+    // The bucket is away.
+    for _round in 0..15 {
+        let taken = take(&queue, HOLD).await;
+        let again = |one: &Outgoing| (one.number, Settled::Again(Duration::from_secs(3600)));
+        let delayed: Vec<_> = taken.iter().map(again).collect();
+        assert!(!taken.iter().any(is_notice), "{taken:?}");
+        queue.settle(delayed).await.expect("settled");
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+    let job = submit(&queue, told("b", "https://b.example/x")).await;
+    queue.cancel(job.id).await.expect("it is cancelled");
+    let taken = take(&queue, HOLD).await;
+    let found: Vec<_> = taken.iter().map(|one| one.job).collect();
+    assert_eq!(found, [job.id]);
+}

@@ -14,7 +14,19 @@ use crate::queue::types::QueueError;
 
 /// After a start of the database, and after this node was cut off from it, the other nodes need
 /// this long to show that they are alive.
-pub(super) const GRACE: Duration = Duration::from_secs(2);
+const GRACE: Duration = Duration::from_secs(2);
+
+/// The same if all nodes may have been cut off: a connection to a database of two addresses takes more
+/// than the 5 s for which the first one is tried.
+const GRACE_AFTER_A_CUT: Duration = Duration::from_secs(8);
+
+/// The time that the other nodes need from the opening of this session on.
+pub(super) fn grace(session: &Session) -> Duration {
+    match session.opens() {
+        0 | 1 => GRACE,
+        _ => GRACE_AFTER_A_CUT,
+    }
+}
 
 /// A node without its lock is dead when it was so at two looks with this time between them.
 pub(super) const SECOND_LOOK: Duration = Duration::from_millis(600);

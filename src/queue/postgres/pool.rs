@@ -3,7 +3,7 @@
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex};
 use std::thread;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot;
 use tokio_util::sync::CancellationToken;
@@ -12,7 +12,13 @@ use super::session::{PATIENCE, Session};
 use crate::queue::types::QueueError;
 use crate::sync::locked;
 
-/// Work for one of the threads.
+/// Time after which a call fails whose statements have no answer: the database's machine is there,
+/// and the database hangs. Whether a change was made is unknown then, as after a lost connection.
+const LONGEST: Duration = Duration::from_secs(30);
+
+const SILENT: &str = "the database does not answer";
+
+/// Work for one of the threads. Nothing is done for a caller that has left.
 type Work = Box<dyn FnOnce(&mut Session) + Send>;
 
 /// Handle to the threads, which end when it is dropped.
@@ -43,15 +49,21 @@ impl Pool {
         let (answer, answered) = oneshot::channel();
         let at = Instant::now();
         let work: Work = Box::new(move |session| {
+            if answer.is_closed() {
+                return;
+            }
             // The call has waited behind others while the database was away.
             let done = match at.elapsed() > PATIENCE && !session.is_open() {
-                true => Err(QueueError::Store("the database does not answer".to_owned())),
+                true => Err(QueueError::Store(SILENT.to_owned())),
                 false => work(session, at),
             };
             let _gone_is_fine = answer.send(done);
         });
         self.work.send(work).map_err(|_| QueueError::Closed)?;
-        answered.await.map_err(|_| QueueError::Closed)?
+        match tokio::time::timeout(LONGEST, answered).await {
+            Ok(answer) => answer.map_err(|_| QueueError::Closed)?,
+            Err(_) => Err(QueueError::Store(SILENT.to_owned())),
+        }
     }
 }
 

@@ -10,7 +10,7 @@ use postgres::fallible_iterator::FallibleIterator;
 
 use super::backlog;
 use super::bell::Changes;
-use super::nodes::{GRACE, SECOND_LOOK, Silent, bury, look, show};
+use super::nodes::{SECOND_LOOK, Silent, bury, grace, look, show};
 use super::session::Session;
 use super::shared::Shared;
 use super::statements::refused;
@@ -63,7 +63,7 @@ impl Presence {
             }
             thread::sleep(SECOND_LOOK);
             let second = look(&mut self.session, node)?;
-            if second.is_young || self.session.age() < GRACE {
+            if second.is_young || self.session.age() < grace(&self.session) {
                 continue;
             }
             for dead in second.silent {
@@ -152,7 +152,7 @@ impl Presence {
     fn look_for_the_dead(&mut self) -> Result<(), QueueError> {
         let look = look(&mut self.session, self.shared.node())?;
         self.shared.nodes.store(look.alive + 1, Ordering::Relaxed);
-        if look.is_young || self.session.age() < GRACE {
+        if look.is_young || self.session.age() < grace(&self.session) {
             return Ok(());
         }
         let now = look.silent;

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use super::bell::Changes;
 use super::locks::SWEEP;
-use super::nodes::GRACE;
+use super::nodes::grace;
 use super::presence::CHANNEL;
 use super::session::{Flush, Session};
 use super::shared::Shared;
@@ -206,7 +206,8 @@ impl Upkeep {
     fn handle_what_is_due(&mut self) -> Result<(), QueueError> {
         let due = self.session.read(Instant::now(), expiry::due)?;
         // While nobody could reach the database, nobody could renew a lease.
-        let may_expire = self.session.age() >= GRACE.min(self.shared.options.lease);
+        let grace = grace(&self.session).min(self.shared.options.lease);
+        let may_expire = self.session.age() >= grace;
         let options = &self.shared.options;
         let lock = format!("SELECT pg_try_advisory_xact_lock({SWEEP}, 0)");
         let began = Instant::now();
@@ -220,7 +221,7 @@ impl Upkeep {
                 if !sql.only(&lock, &[])?.get::<bool>(0)? {
                     return Ok(false);
                 }
-                let left = (!may_expire).then_some(GRACE);
+                let left = (!may_expire).then_some(grace);
                 expiry::look_after(sql, effects, options, id, left)?;
                 Ok(true)
             };

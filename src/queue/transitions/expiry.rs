@@ -139,6 +139,26 @@ pub(in crate::queue) fn remove(
     }
 }
 
+/// Begins the retention of an ended ephemeral job anew.
+pub(in crate::queue) fn keep(
+    sql: &dyn Sql,
+    options: &QueueOptions,
+    id: JobId,
+) -> Result<(), QueueError> {
+    let job = rows::lock_known(sql, id)?;
+    if job.state.is_end() && !job.durable && job.parent.is_none() {
+        put_off(sql, options, id)?;
+    }
+    Ok(())
+}
+
+/// Lets a job be forgotten only after the retention of answered jobs from now on.
+fn put_off(sql: &dyn Sql, options: &QueueOptions, id: JobId) -> Result<(), QueueError> {
+    let later = sql.now().after(options.answered_retention);
+    sql.query("UPDATE jobs SET due = ?2 WHERE id = ?1", values![id, later])?;
+    Ok(())
+}
+
 /// Removes an ended job whose retention is over. It is kept for longer while a job that follows it
 /// may still use its results.
 fn forget_or_keep(
@@ -150,12 +170,7 @@ fn forget_or_keep(
     if fair_queue::followers(sql, job.id)?.is_empty() {
         return forget(sql, effects, job.id);
     }
-    let later = sql.now().after(options.answered_retention);
-    sql.query(
-        "UPDATE jobs SET due = ?2 WHERE id = ?1",
-        values![job.id, later],
-    )?;
-    Ok(())
+    put_off(sql, options, job.id)
 }
 
 /// Removes an ended job and its pairs.

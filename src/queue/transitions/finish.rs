@@ -179,6 +179,13 @@ pub(in crate::queue) fn requeue(
     if !job.state.is_end() || (job.state == State::Succeeded && !lost) {
         return Err(QueueError::NotTerminal(job.state));
     }
+    if let Some(sequence) = job.parent {
+        // Its closing job reads the results of all pairs.
+        let sequence = rows::lock_known(sql, sequence)?;
+        if sequence.ready.is_some() && !sequence.state.is_end() {
+            return Err(QueueError::NotTerminal(sequence.state));
+        }
+    }
     let unfinished: Vec<Job> = match job.kind {
         Kind::Pair => Vec::new(),
         Kind::Sequence => rows::pairs(sql, id)?

@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use super::rows;
 use super::rows::delivery_code;
+use crate::clock::Timestamp;
 use crate::job::{DeliveryState, Job, JobId, State, ended_notice};
 use crate::queue::outgoing::{Action, Outgoing, Settled};
 use crate::queue::sql::{Row, Sql, values};
@@ -19,13 +20,14 @@ pub(in crate::queue) const DUE: &str = "SELECT seq, job, url, body FROM outbox I
 /// A delivery may take this many times as long as other actions.
 const DELIVERY_HOLDS: u32 = 10;
 
-/// When a notice is looked at again whose job is still delivering its result.
+/// The least delay of a notice whose job is still delivering its result.
 const NOTICE_DELAY: Duration = Duration::from_millis(500);
 
-/// The statement that finds a delivery of a job or of one of its pairs. The query plan test also uses it.
-pub(in crate::queue) const UNDELIVERED: &str = "SELECT seq FROM outbox INDEXED BY outbox_job \
+/// The statement that finds when the last delivery of a job and of its pairs is due. The query plan test
+/// also uses it.
+pub(in crate::queue) const UNDELIVERED: &str = "SELECT max(due) FROM outbox INDEXED BY outbox_job \
     WHERE job IN (SELECT ?1 UNION ALL SELECT id FROM jobs INDEXED BY jobs_parent WHERE parent = ?1) \
-    AND url IS NOT NULL AND body IS NULL LIMIT 1";
+    AND url IS NOT NULL AND body IS NULL";
 
 /// Promises to remove the files of a job.
 pub(super) fn remove_files(sql: &dyn Sql, id: JobId) -> Result<(), QueueError> {
@@ -99,11 +101,15 @@ fn take_row(sql: &dyn Sql, row: &Row, hold: Duration) -> Result<Option<Outgoing>
                 return Ok(None);
             }
         },
-        (Some(_), Some(_)) if is_being_delivered(sql, job)? => {
-            put_off(sql, number, NOTICE_DELAY, 0)?;
-            return Ok(None);
-        }
-        (Some(url), Some(body)) => (Action::Notify { url, body }, hold),
+        (Some(url), Some(body)) => match delivered_at(sql, job)? {
+            None => (Action::Notify { url, body }, hold),
+            // The end of the last delivery makes it due sooner.
+            Some(at) => {
+                let delay = sql.now().until(at).max(NOTICE_DELAY);
+                put_off(sql, number, delay, 0)?;
+                return Ok(None);
+            }
+        },
     };
     let text = "UPDATE outbox SET due = ?2, attempts = attempts + 1 WHERE seq = ?1 \
                 RETURNING attempts";
@@ -116,9 +122,10 @@ fn take_row(sql: &dyn Sql, row: &Row, hold: Duration) -> Result<Option<Outgoing>
     }))
 }
 
-/// Whether the result of a job, or of a pair of it, is still to be delivered.
-fn is_being_delivered(sql: &dyn Sql, job: JobId) -> Result<bool, QueueError> {
-    Ok(sql.first(UNDELIVERED, values![job])?.is_some())
+/// When the result of a job, or the last result of its pairs, is due to be delivered. `None` if nothing
+/// is to be delivered any more.
+fn delivered_at(sql: &dyn Sql, job: JobId) -> Result<Option<Timestamp>, QueueError> {
+    sql.only(UNDELIVERED, values![job])?.get(0)
 }
 
 /// Makes a row due after a delay, and does not count this many of its attempts.
@@ -158,6 +165,11 @@ fn remove(sql: &dyn Sql, number: i64, state: DeliveryState) -> Result<(), QueueE
         let text = "UPDATE jobs SET delivery = ?2 WHERE id = ?1 AND state = 2";
         let job: JobId = row.get(0)?;
         sql.query(text, values![job, delivery_code(state)])?;
+        // Notices that have waited for it.
+        let text = "UPDATE outbox SET due = ?2 WHERE body IS NOT NULL AND attempts = 0 AND due > ?2 \
+                    AND job IN (SELECT ?1 UNION ALL SELECT parent FROM jobs WHERE id = ?1 \
+                    AND parent IS NOT NULL)";
+        sql.query(text, values![job, sql.now()])?;
     }
     Ok(())
 }

@@ -1,5 +1,6 @@
 //! Contract tests of the queue on PostgreSQL, and tests of several nodes.
 
+use std::process::Command;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
@@ -16,7 +17,7 @@ use crate::queue::interface::Queue;
 use crate::queue::migration::Migration;
 use crate::queue::sql::for_postgres;
 use crate::queue::transitions::{expiry, fair_queue, leases, standing};
-use crate::queue::types::{Event, QueueOptions, Submitted};
+use crate::queue::types::{Event, QueueError, QueueOptions, Submitted};
 
 #[path = "../../../../tests/common/postgres_server.rs"]
 mod postgres_server;
@@ -180,6 +181,38 @@ async fn a_database_of_an_older_version_is_upgraded_and_keeps_its_jobs() {
         };
         assert_eq!(held.job.id, job.id);
     }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn calls_fail_in_time_while_the_database_hangs_and_work_afterwards() {
+    // What is stopped may hold locks of the whole server.
+    let Some(server) = start_postgres() else {
+        return;
+    };
+    let database = Database::on(Server::Own(Arc::new(server)));
+    let (queue, _heard) = database.node("one", QueueOptions::default()).await;
+    let Ok(Submitted::New(job)) = queue.submit(submission("a")).await else {
+        unreachable!("it is new");
+    };
+    // The machine of the database answers for its stopped processes: connections open and do not end.
+    let pids = "SELECT split_part(pg_read_file('postmaster.pid'), E'\\n', 1) || ' ' || \
+                string_agg(pid::text, ' ') FROM pg_stat_activity WHERE pid <> pg_backend_pid()";
+    let pids = database.server.sql(database.name(), pids);
+    let send = |signal: &str| {
+        let sent = Command::new("kill")
+            .arg(signal)
+            .args(pids.split(' '))
+            .status();
+        assert!(sent.expect("kill runs").success(), "{pids}");
+    };
+    send("-STOP");
+    let asked = queue.submit(submission("a"));
+    let answer = tokio::time::timeout(Duration::from_secs(60), asked).await;
+    send("-CONT");
+    let refused = answer.expect("an answer while the database hangs");
+    assert!(matches!(refused, Err(QueueError::Store(_))), "{refused:?}");
+    let held = queue.lease("worker", DeviceKind::Cpu).await.expect("a job");
+    assert_eq!(held.job.id, job.id);
 }
 
 #[tokio::test]

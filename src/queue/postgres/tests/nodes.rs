@@ -54,14 +54,16 @@ async fn work(queue: Arc<dyn Queue>) -> HashMap<JobId, u32> {
         let queue = Arc::clone(&queue);
         lanes.spawn(async move {
             let mut held = Vec::new();
-            let a_while = Duration::from_secs(2);
-            while let Ok(lease) = timeout(a_while, queue.lease("worker", DeviceKind::Cpu)).await {
-                let lease = lease.expect("a lease");
+            loop {
+                let a_while = std::pin::pin!(tokio::time::sleep(Duration::from_secs(2)));
+                let lease = queue.lease_until("worker", DeviceKind::Cpu, a_while).await;
+                let Some(lease) = lease.expect("the store works") else {
+                    break held;
+                };
                 held.push(lease.job.id);
                 let ended = finish(&queue, &lease, done()).await;
                 assert_eq!(ended, Committed::Yes(State::Succeeded));
             }
-            held
         });
     }
     let mut times = HashMap::new();

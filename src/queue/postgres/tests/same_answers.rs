@@ -8,7 +8,6 @@ use std::time::Duration;
 
 use rand_core::{Rng, SeedableRng};
 use tokio::sync::mpsc;
-use tokio::time::timeout;
 
 use super::{Arc, Database, Event, Queue, QueueOptions};
 use crate::clock::Timestamp;
@@ -171,8 +170,9 @@ impl Side {
         kind: DeviceKind,
         patience: Duration,
     ) -> Option<String> {
-        let lease = timeout(patience, self.queue.lease("worker", kind)).await;
-        let lease = lease.ok()?.expect("a lease");
+        let patience = std::pin::pin!(tokio::time::sleep(patience));
+        let lease = self.queue.lease_until("worker", kind, patience).await;
+        let lease = lease.expect("the store works")?;
         let told = described(&lease.job);
         self.past[worker] = Some((lease.job.id, lease.job.attempt));
         self.leases[worker] = Some(lease);
