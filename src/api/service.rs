@@ -396,7 +396,7 @@ impl Service {
         self.wait_for_end(&mut news, longest).await
     }
 
-    /// [`Service::wait`] by somebody who has subscribed to the job.
+    /// [`Service::wait`] on an existing subscription to the job.
     pub(super) async fn wait_for_end(
         &self,
         news: &mut watch::Receiver<Arc<Job>>,

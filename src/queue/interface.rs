@@ -112,9 +112,8 @@ pub trait Queue: Send + Sync {
     /// the store.
     async fn remove(&self, id: JobId) -> Result<(), QueueError>;
 
-    /// Begins the retention of an ended ephemeral job anew, because somebody still waits to read its
-    /// result. Returns that retention ([`QueueOptions::answered_retention`]). Other jobs stay as they
-    /// are.
+    /// Restarts the retention of an ended ephemeral job. Its result has not been read yet. Returns
+    /// the retention, [`QueueOptions::answered_retention`]. Other jobs are not changed.
     ///
     /// [`QueueOptions::answered_retention`]: super::QueueOptions::answered_retention
     ///
