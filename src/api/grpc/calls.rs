@@ -3,7 +3,6 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use prost::Message as _;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status, Streaming};
@@ -128,10 +127,7 @@ async fn send_flow(
     answers: &mpsc::Sender<Result<proto::EstimateFlowResponse, Status>>,
 ) -> Result<bool, ApiError> {
     use proto::estimate_flow_response::Part;
-    let send = async |part: Part| {
-        let message = proto::EstimateFlowResponse { part: Some(part) };
-        answers.send(Ok(message)).await.is_ok()
-    };
+    let message = |part: Part| proto::EstimateFlowResponse { part: Some(part) };
     let mut sent = None;
     let mut news = service.queue.watch(id).await?;
     let job = loop {
@@ -144,7 +140,8 @@ async fn send_flow(
                 if job.progress.is_some() && job.progress != sent {
                     sent = job.progress;
                     let progress = job.progress.map(convert::progress).unwrap_or_default();
-                    if !send(Part::Progress(progress)).await {
+                    let progress = message(Part::Progress(progress));
+                    if answers.send(Ok(progress)).await.is_err() {
                         return Ok(false);
                     }
                 }
@@ -152,22 +149,11 @@ async fn send_flow(
         }
     };
     let answer = service.answer(&job).await?;
-    let sending = async {
-        if !send(Part::Header(convert::header(&answer))).await {
-            return;
-        }
-        for piece in chunks::pieces(&answer, 0) {
-            let length = piece.flow.len();
-            if !send(Part::Chunk(piece)).await {
-                return;
-            }
-            answer.room.taking().took(length);
-        }
-    };
-    tokio::select! {
-        () = sending => Ok(true),
-        () = answer.room.taking().evicted() => Err(ApiError::TakenTooSlowly),
-    }
+    let header = Part::Header(convert::header(&answer));
+    let pieces = chunks::pieces(&answer, 0).map(Part::Chunk);
+    let messages = std::iter::once(header).chain(pieces).map(message);
+    chunks::send(messages, answers, answer.room.taking()).await?;
+    Ok(true)
 }
 
 /// Sends the parts of a result until it is evicted for a slow client.
@@ -176,19 +162,9 @@ async fn send_result(
     answers: mpsc::Sender<Result<proto::DownloadResultResponse, Status>>,
     taking: Arc<ReadProgress>,
 ) {
-    for part in parts {
-        let message = proto::DownloadResultResponse { part: Some(part) };
-        let length = message.encoded_len();
-        tokio::select! {
-            sent = answers.send(Ok(message)) => match sent {
-                Ok(()) => taking.took(length),
-                Err(_) => return,
-            },
-            () = taking.evicted() => {
-                let _gone_is_fine = answers.try_send(Err(ApiError::TakenTooSlowly.into()));
-                return;
-            }
-        }
+    let messages = parts.map(|part| proto::DownloadResultResponse { part: Some(part) });
+    if let Err(error) = chunks::send(messages, &answers, &taking).await {
+        let _gone_is_fine = answers.try_send(Err(error.into()));
     }
 }
 

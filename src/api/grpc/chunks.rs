@@ -2,11 +2,14 @@
 
 use std::sync::Arc;
 
-use tonic::Streaming;
+use prost::Message;
+use tokio::sync::mpsc;
+use tonic::{Status, Streaming};
 
 use super::{convert, proto};
 use crate::api::codec;
 use crate::api::error::ApiError;
+use crate::api::result_budget::ReadProgress;
 use crate::api::results::Answer;
 use crate::api::service::Service;
 use crate::api::upload_budget::UploadReservation;
@@ -150,6 +153,28 @@ pub(super) fn dense_pieces(
                 flags: flags.into(),
             }
         })
+}
+
+/// Sends the messages of a result in their order. Returns false if the client disconnects.
+///
+/// # Errors
+/// [`ApiError::TakenTooSlowly`] if the result is evicted for a slow client.
+pub(super) async fn send<M: Message>(
+    messages: impl Iterator<Item = M>,
+    answers: &mpsc::Sender<Result<M, Status>>,
+    taking: &ReadProgress,
+) -> Result<bool, ApiError> {
+    for message in messages {
+        let length = message.encoded_len();
+        tokio::select! {
+            sent = answers.send(Ok(message)) => match sent {
+                Ok(()) => taking.took(length),
+                Err(_) => return Ok(false),
+            },
+            () = taking.evicted() => return Err(ApiError::TakenTooSlowly),
+        }
+    }
+    Ok(true)
 }
 
 /// The chunks of a flow from row `first`.

@@ -41,7 +41,7 @@ struct Pending {
     /// The job, or the error of its submission.
     job: Result<Accepted, ApiError>,
     /// The client may read the pairs before it slowly.
-    kept: Option<KeptResult>,
+    _kept: Option<KeptResult>,
 }
 
 /// A message from the reader task to the writer task, in order.
@@ -245,13 +245,15 @@ impl Reader {
         let names = (name(index), name(index + 1));
         let job = self.submit(index).await;
         self.before = job.as_ref().ok().map(|accepted| accepted.job.id);
-        let kept = self.before.map(|id| KeptResult::of(&self.service, id));
+        let kept = self
+            .before
+            .map(|id| KeptResult::of(&self.service.queue, id));
         let _sender = place_in_line.send(Item::Pair(Pending {
             index: u32::try_from(index).unwrap_or(u32::MAX),
             source: names.0,
             target: names.1,
             job,
-            kept,
+            _kept: kept,
         }));
         Ok(())
     }
@@ -310,14 +312,13 @@ async fn write(service: &Arc<Service>, mut items: mpsc::Receiver<Item>, answers:
 async fn send(service: &Arc<Service>, pair: Pending, answers: &ResultBudget) -> bool {
     use proto::estimate_sequence_response::pair::Outcome;
     use proto::estimate_sequence_response::{Pair, Part};
-    let message = |part: Part| Ok(proto::EstimateSequenceResponse { part: Some(part) });
+    let message = |part: Part| proto::EstimateSequenceResponse { part: Some(part) };
     let header = |outcome: Outcome| Pair {
         index: pair.index,
         source: pair.source.clone(),
         target: pair.target.clone(),
         outcome: Some(outcome),
     };
-    let kept = pair.kept;
     let answer = match pair.job {
         Err(error) => Err(error),
         Ok(accepted) => match service.wait(accepted.job.id, None).await {
@@ -331,32 +332,19 @@ async fn send(service: &Arc<Service>, pair: Pending, answers: &ResultBudget) -> 
             Err(error) => Err(error),
         },
     };
-    drop(kept);
     match answer {
         Err(error) => {
             service.count_late_error("grpc", &error);
             let failed = header(Outcome::Error(convert::pair_error(&error)));
-            answers.send(message(Part::Pair(failed))).await.is_ok()
+            answers.send(Ok(message(Part::Pair(failed)))).await.is_ok()
         }
         Ok(answer) => {
-            let sending = async {
-                let head = header(Outcome::Header(Box::new(convert::header(&answer))));
-                if answers.send(message(Part::Pair(head))).await.is_err() {
-                    return false;
-                }
-                for piece in chunks::pieces(&answer, 0) {
-                    let length = piece.flow.len();
-                    if answers.send(message(Part::Chunk(piece))).await.is_err() {
-                        return false;
-                    }
-                    answer.room.taking().took(length);
-                }
-                true
-            };
-            tokio::select! {
-                sent = sending => sent,
-                () = answer.room.taking().evicted() => {
-                    let error = ApiError::TakenTooSlowly;
+            let head = header(Outcome::Header(Box::new(convert::header(&answer))));
+            let pieces = chunks::pieces(&answer, 0).map(Part::Chunk);
+            let messages = std::iter::once(Part::Pair(head)).chain(pieces).map(message);
+            match chunks::send(messages, answers, answer.room.taking()).await {
+                Ok(sent) => sent,
+                Err(error) => {
                     service.count_late_error("grpc", &error);
                     let _gone_is_fine = answers.try_send(Err(error.into()));
                     false

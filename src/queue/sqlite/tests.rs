@@ -101,6 +101,7 @@ fn the_statements_of_the_hot_path_sort_nothing_and_scan_no_table() {
         (expiry::NEXT_DUE, 0),
         (outbox::DUE, 2),
         (outbox::UNDELIVERED, 1),
+        (outbox::WAKE_NOTICES, 2),
     ] {
         let plan = plan(&connection, sql, parameters);
         assert!(!plan.contains("TEMP B-TREE"), "{sql}: {plan}");

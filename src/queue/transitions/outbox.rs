@@ -29,6 +29,12 @@ pub(in crate::queue) const UNDELIVERED: &str = "SELECT max(due) FROM outbox INDE
     WHERE job IN (SELECT ?1 UNION ALL SELECT id FROM jobs INDEXED BY jobs_parent WHERE parent = ?1) \
     AND url IS NOT NULL AND body IS NULL";
 
+/// The statement that makes the notices due that wait for a delivery of this job. The query plan test
+/// also uses it.
+pub(in crate::queue) const WAKE_NOTICES: &str = "UPDATE outbox INDEXED BY outbox_job SET due = ?2 \
+    WHERE job IN (SELECT ?1 UNION ALL SELECT parent FROM jobs INDEXED BY jobs_id WHERE id = ?1 \
+    AND parent IS NOT NULL) AND body IS NOT NULL AND attempts = 0 AND due > ?2";
+
 /// Promises to remove the files of a job.
 pub(super) fn remove_files(sql: &dyn Sql, id: JobId) -> Result<(), QueueError> {
     insert(sql, id, None, None)
@@ -165,11 +171,7 @@ fn remove(sql: &dyn Sql, number: i64, state: DeliveryState) -> Result<(), QueueE
         let text = "UPDATE jobs SET delivery = ?2 WHERE id = ?1 AND state = 2";
         let job: JobId = row.get(0)?;
         sql.query(text, values![job, delivery_code(state)])?;
-        // Notices that have waited for it.
-        let text = "UPDATE outbox SET due = ?2 WHERE body IS NOT NULL AND attempts = 0 AND due > ?2 \
-                    AND job IN (SELECT ?1 UNION ALL SELECT parent FROM jobs WHERE id = ?1 \
-                    AND parent IS NOT NULL)";
-        sql.query(text, values![job, sql.now()])?;
+        sql.query(WAKE_NOTICES, values![job, sql.now()])?;
     }
     Ok(())
 }

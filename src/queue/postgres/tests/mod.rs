@@ -59,6 +59,11 @@ impl Database {
         Some(Self::on(Server::Of(shared_postgres()?)))
     }
 
+    /// A new one on a server of its own, which the test may crash; `None` without PostgreSQL.
+    fn alone() -> Option<Self> {
+        Some(Self::on(Server::Own(Arc::new(start_postgres()?))))
+    }
+
     fn on(server: Server) -> Self {
         let url = server.database();
         Self { server, url }
@@ -186,10 +191,9 @@ async fn a_database_of_an_older_version_is_upgraded_and_keeps_its_jobs() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn calls_fail_in_time_while_the_database_hangs_and_work_afterwards() {
     // What is stopped may hold locks of the whole server.
-    let Some(server) = start_postgres() else {
+    let Some(database) = Database::alone() else {
         return;
     };
-    let database = Database::on(Server::Own(Arc::new(server)));
     let (queue, _heard) = database.node("one", QueueOptions::default()).await;
     let Ok(Submitted::New(job)) = queue.submit(submission("a")).await else {
         unreachable!("it is new");

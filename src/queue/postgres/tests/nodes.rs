@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
-use super::{Database, Server, start_postgres};
+use super::Database;
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, JobId, JobProgress, Priority, State};
 use crate::queue::contract_tests::{done, submission};
@@ -161,10 +161,9 @@ async fn a_node_that_loses_its_connections_goes_on_and_keeps_its_jobs() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_crash_of_the_database_loses_no_promise_and_blames_no_job() {
-    let Some(server) = start_postgres() else {
+    let Some(database) = Database::alone() else {
         return;
     };
-    let database = Database::on(Server::Own(Arc::new(server)));
     let (one, _heard) = database.node("one", QueueOptions::default()).await;
     let (other, _heard) = database.node("other", QueueOptions::default()).await;
     submit(&one, submission("a")).await;
