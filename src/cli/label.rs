@@ -150,6 +150,7 @@ impl Label {
     fn options(&self) -> Result<JobOptions, Failure> {
         let options = self.estimation.options()?;
         let solver = options.solver_options(0);
+        let has_ego_motion = self.known_poses || solver.ego != Ego::Off;
         let refused = if let Some(file) = self.estimation.files().first() {
             Some(format!(
                 "{}: poses, motions and rasters of a run are those of its manifest: see --known-poses",
@@ -163,8 +164,15 @@ impl Label {
             Some("tracks need every pair, and --layout av2-v2 has every fifth".to_owned())
         } else if self.tracks && !matches!(solver.method, Method::Objects(_)) {
             Some("tracks need clusters: use --preset default or label".to_owned())
-        } else if self.tracks && !self.known_poses && solver.ego == Ego::Off {
+        } else if self.tracks && !has_ego_motion {
             Some("tracks need the ego motion: leave --ego off away".to_owned())
+        } else if self.layout.needs_ego_motion() && !has_ego_motion {
+            Some(format!(
+                "--layout {} needs the ego motion, which --ego off leaves out: by --preset {} it is given \
+                 with --ego auto or --known-poses",
+                self.layout.name(),
+                options.preset.preset().name()
+            ))
         } else {
             None
         };

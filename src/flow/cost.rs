@@ -106,12 +106,17 @@ pub fn neighbor_cost(points: usize) -> NeighborCost {
 /// distance transform. Computes no distances.
 ///
 /// # Errors
-/// [`FlowError::NotMetres`], [`FlowError::TooFewPoints`], [`FlowError::NoGroundMask`] or
+/// [`FlowError::NotMetres`], [`FlowError::NotSensorFrame`], [`FlowError::TooFewPoints`], [`FlowError::NoGroundMask`] or
 /// [`FlowError::GroundMaskLength`] for the pair, and [`FlowError::Backend`] if the distance transform is rejected: as
 /// [`super::estimate()`]. The ground masks of neighbor sweeps and the limits of a device are not
 /// checked.
 pub fn predict_cost(problem: &Problem, options: &Options) -> Result<Cost, FlowError> {
-    let selection = select(problem, options, &find_ground)?;
+    let selection = select(
+        problem,
+        [problem.source, problem.target],
+        options,
+        &find_ground,
+    )?;
     let (source_points, target_points) = (selection.source.len(), selection.target.len());
     let method = match &options.method {
         Method::Objects(_) => object_cost(source_points + target_points),

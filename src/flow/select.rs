@@ -7,7 +7,7 @@ use std::borrow::Cow;
 use super::data::{MIN_POINTS, Point, Random, square_distance, stride_sample};
 use super::error::FlowError;
 use super::ground;
-use super::options::{Ego, Ground, MAX_SPREAD_M, Method, Options};
+use super::options::{Ego, Ground, MAX_AWAY_M, MAX_SPREAD_M, Method, Options};
 use super::problem::{NeighborSweep, Problem};
 
 /// The selected points of a pair.
@@ -31,6 +31,8 @@ pub(crate) struct Selection {
     /// All points of the two clouds that `source` and `target` were sampled from; none where they
     /// were not sampled.
     pub(crate) undrawn: Option<[Vec<Point>; 2]>,
+    /// Whether the ground is among the selected points.
+    pub(crate) has_ground: bool,
 }
 
 /// Ground segmentation of several sweeps: one mask per sweep. All points are finite and within the
@@ -42,31 +44,36 @@ pub(crate) fn find_ground(sweeps: &[&[Point]]) -> Vec<Vec<bool>> {
     sweeps.iter().map(|points| ground::mask(points)).collect()
 }
 
-/// Selects the points of `problem` by `options`.
+/// Selects the points of `problem` by `options`. `given` are the source and the target as they were
+/// measured, before any deskewing: a point is within the crop and far enough from the sensor where both
+/// of its positions are.
 ///
 /// # Errors
-/// [`FlowError`] where coordinates are not metres, a mask is missing or has another length, or fewer
+/// [`FlowError`] where coordinates are not metres or not those of a sensor's frame, a mask is missing or has another length, or fewer
 /// than [`MIN_POINTS`] points of a cloud remain.
 pub(crate) fn select(
     problem: &Problem,
+    given: [&[Point]; 2],
     options: &Options,
     find: FindGround<'_>,
 ) -> Result<Selection, FlowError> {
     check_metres("source", problem.source, options)?;
     check_metres("target", problem.target, options)?;
-    let given = problem.ground.map_or([None; 2], |masks| masks.map(Some));
-    let sweeps = [(problem.source, given[0]), (problem.target, given[1])];
+    let known = problem.ground.map_or([None; 2], |masks| masks.map(Some));
+    let sweeps = [(problem.source, known[0]), (problem.target, known[1])];
     let mut masks = ground_masks(sweeps, options, find)?;
-    let [mut rows, mut target_rows] = rows_of_pair(problem, &masks, options)?;
+    let [mut rows, mut target_rows] = rows_of_pair(problem, given, &masks, options)?;
     if options.ground == Ground::Auto && rows.len().min(target_rows.len()) < MIN_POINTS {
         // Clouds that are nearly all ground keep their ground points.
         masks = [None, None];
-        [rows, target_rows] = rows_of_pair(problem, &masks, options)?;
+        [rows, target_rows] = rows_of_pair(problem, given, &masks, options)?;
     }
+    let has_ground = masks.iter().any(Option::is_none);
     let ego_only_rows = match &masks {
         [Some(ground), _] if options.ground == Ground::Auto && options.max_points.is_none() => {
             let rows = 0..ground.len();
-            rows.filter(|&row| ground[row] && is_in_crop(problem.source[row], options))
+            let positions = |row: usize| [problem.source[row], given[0][row]];
+            rows.filter(|&row| ground[row] && are_in_crop(positions(row), options))
                 .collect()
         }
         _ => Vec::new(),
@@ -111,6 +118,7 @@ pub(crate) fn select(
         registration_clouds: (options.ego == Ego::Auto)
             .then(|| [problem.source, problem.target].map(|points| cropped(points, options))),
         undrawn,
+        has_ground,
         rows,
         target_rows,
         output_rows,
@@ -122,10 +130,10 @@ fn points_at(rows: &[usize], points: &[Point]) -> Vec<Point> {
     rows.iter().map(|&row| points[row]).collect()
 }
 
-/// Refuses points that lie too far apart for metres.
+/// Refuses points that lie too far apart for metres, or too far from the origin for a sensor's frame.
 ///
 /// # Errors
-/// [`FlowError::NotMetres`].
+/// [`FlowError::NotMetres`], [`FlowError::NotSensorFrame`].
 fn check_metres(cloud: &'static str, points: &[Point], options: &Options) -> Result<(), FlowError> {
     /// Points that are looked at.
     const SAMPLED: usize = 1024;
@@ -144,6 +152,10 @@ fn check_metres(cloud: &'static str, points: &[Point], options: &Options) -> Res
         )
     };
     let middle: Point = core::array::from_fn(axis);
+    let away_m = square_distance(middle, [0.0; 3]).sqrt();
+    if away_m > MAX_AWAY_M {
+        return Err(FlowError::NotSensorFrame { cloud, away_m });
+    }
     let from_middle = sampled.iter().filter(finite);
     let from_middle = from_middle.map(|&point| square_distance(point, middle).sqrt());
     let spread_m = median(from_middle.collect());
@@ -172,7 +184,8 @@ pub(crate) fn select_neighbor(
     find: FindGround<'_>,
 ) -> Result<Vec<Point>, FlowError> {
     let [mask] = ground_masks([(sweep.points, sweep.ground)], options, find)?;
-    let rows = selected_rows("neighbor sweep", sweep.points, mask.as_deref(), options)?;
+    let points = [sweep.points; 2];
+    let rows = selected_rows("neighbor sweep", points, mask.as_deref(), options)?;
     Ok(rows.into_iter().map(|row| sweep.points[row]).collect())
 }
 
@@ -230,21 +243,40 @@ pub(crate) fn is_in_crop([x, y, z]: Point, options: &Options) -> bool {
     finite && x.abs() <= crop && y.abs() <= crop && is_far
 }
 
+/// Whether all positions of a point are within the crop, see [`is_in_crop`].
+fn are_in_crop(positions: [Point; 2], options: &Options) -> bool {
+    positions
+        .iter()
+        .all(|&position| is_in_crop(position, options))
+}
+
 fn rows_of_pair(
     problem: &Problem,
+    given: [&[Point]; 2],
     [source, target]: &[Option<Cow<'_, [bool]>>; 2],
     options: &Options,
 ) -> Result<[Vec<usize>; 2], FlowError> {
     Ok([
-        selected_rows("source", problem.source, source.as_deref(), options)?,
-        selected_rows("target", problem.target, target.as_deref(), options)?,
+        selected_rows(
+            "source",
+            [problem.source, given[0]],
+            source.as_deref(),
+            options,
+        )?,
+        selected_rows(
+            "target",
+            [problem.target, given[1]],
+            target.as_deref(),
+            options,
+        )?,
     ])
 }
 
-/// Rows of `points` that are finite, within the crop and not masked.
+/// Rows of `points` that are finite, within the crop and not masked. `given` are the points as they
+/// were measured.
 fn selected_rows(
     cloud: &'static str,
-    points: &[Point],
+    [points, given]: [&[Point]; 2],
     mask: Option<&[bool]>,
     options: &Options,
 ) -> Result<Vec<usize>, FlowError> {
@@ -258,7 +290,8 @@ fn selected_rows(
         });
     }
     Ok((0..points.len())
-        .filter(|&row| is_in_crop(points[row], options) && !mask.is_some_and(|mask| mask[row]))
+        .filter(|&row| are_in_crop([points[row], given[row]], options))
+        .filter(|&row| !mask.is_some_and(|mask| mask[row]))
         .collect())
 }
 
@@ -276,9 +309,12 @@ mod tests {
             before: None,
             neighbors: &[],
         };
-        select(&problem, options, &find_ground)
-            .expect("enough points")
-            .rows
+        selected(&problem, options).rows
+    }
+
+    fn selected(problem: &Problem<'_>, options: &Options) -> Selection {
+        let given = [problem.source, problem.target];
+        select(problem, given, options, &find_ground).expect("enough points")
     }
 
     #[test]
@@ -301,6 +337,23 @@ mod tests {
             options.ground = leaves_out;
             assert_eq!(rows(&options, &source, Some(&ground)), [0, 2, 5]);
         }
+    }
+
+    #[test]
+    fn a_point_is_within_the_crop_where_it_was_measured_and_where_it_is_now() {
+        let [measured, deskewed] = [[1.5, 3.0, 60.0, 10.0, 10.0], [3.0, 1.5, 40.0, 60.0, 11.0]]
+            .map(|along| along.map(|x| [x, 0.0, 0.0]));
+        let mut options = Preset::Default.options(None);
+        (options.ground, options.ego) = (Ground::Keep, Ego::Off);
+        (options.crop_m, options.min_range_m) = (Some(50.0), Some(2.0));
+        let all = [measured.as_slice(), &deskewed].concat();
+        let given = [deskewed.as_slice(), &measured].concat();
+        let problem = Problem::pair(&all, &all);
+        let selection = select(&problem, [&given, &all], &options, &find_ground);
+        assert!(matches!(
+            selection,
+            Err(FlowError::TooFewPoints { points: 2, .. })
+        ));
     }
 
     #[test]
@@ -327,14 +380,14 @@ mod tests {
         let mut options = Preset::Neural.options(Some(10));
         options.ground = Ground::Mask;
         options.crop_m = Some(60.0);
-        let selection = select(&problem, &options, &find_ground).expect("enough points");
+        let selection = selected(&problem, &options);
         assert_eq!(selection.source.len(), 10);
         assert_eq!(
             selection.registration_clouds,
             Some([(); 2].map(|()| source[..=60].to_vec()))
         );
         options.ego = Ego::Off;
-        let selection = select(&problem, &options, &find_ground).expect("enough points");
+        let selection = selected(&problem, &options);
         assert_eq!(selection.registration_clouds, None);
     }
 
@@ -359,8 +412,8 @@ mod tests {
         let mut objects = Preset::Default.options(Some(40));
         (fitted.ground, objects.ground) = (Ground::Keep, Ground::Keep);
         let problem = Problem::pair(&source, &source);
-        let fitted = select(&problem, &fitted, &find_ground).expect("enough points");
-        let objects = select(&problem, &objects, &find_ground).expect("enough points");
+        let fitted = selected(&problem, &fitted);
+        let objects = selected(&problem, &objects);
         assert_eq!((objects.rows.len(), objects.target.len()), (100, 100));
         let output_rows = |selection: &Selection| -> Vec<usize> {
             let places = selection.output_rows.iter();
@@ -379,8 +432,7 @@ mod tests {
         };
         let (source, target) = (line(50), line(4000));
         let problem = Problem::pair(&source, &target);
-        let selection =
-            select(&problem, &Preset::Neural.options(Some(300)), &find_ground).expect("points");
+        let selection = selected(&problem, &Preset::Neural.options(Some(300)));
         assert_eq!(selection.source.len(), 50);
         assert_eq!(selection.target.len(), 300);
         let last = selection.target.iter().map(|p| p[0]).fold(0.0, f32::max);
@@ -398,7 +450,8 @@ mod tests {
             neighbors: &[],
         };
         let mut options = Preset::Neural.options(None);
-        let error = select(&problem, &options, &find_ground).expect_err("one point");
+        let given = [problem.source, problem.target];
+        let error = select(&problem, given, &options, &find_ground).expect_err("one point");
         assert!(matches!(
             error,
             FlowError::TooFewPoints {
@@ -407,7 +460,7 @@ mod tests {
             }
         ));
         options.ground = Ground::Mask;
-        let error = select(&problem, &options, &find_ground).expect_err("no mask");
+        let error = select(&problem, given, &options, &find_ground).expect_err("no mask");
         assert!(matches!(error, FlowError::NoGroundMask));
     }
 }

@@ -275,6 +275,11 @@ impl Sequence {
         pushed
     }
 
+    /// The number of sweeps and the number of estimated pairs so far.
+    pub fn position(&self) -> [usize; 2] {
+        [self.count, self.next]
+    }
+
     /// Returns the estimates of the remaining pairs at the end of the sequence, in order. Where a
     /// pair after the first of them fails, the list ends before it. Call `finish` until it returns
     /// an empty list.

@@ -56,8 +56,10 @@ pub fn pair_interval_s(names: [&str; 2], clocks: [Option<SweepClock>; 2]) -> Opt
             let (source, target) = source.zip(target)?;
             let apart = source.sweep_s.zip(target.sweep_s);
             let apart = apart.map(|(source, target)| (target - source).abs());
-            let apart = apart.filter(|&apart| apart > 0.0 && apart <= MAX_INTERVAL_S);
-            Some(apart.unwrap_or(source.duration_s) as f32)
+            let is_interval = |&seconds: &f64| seconds > 0.0 && seconds <= MAX_INTERVAL_S;
+            let apart = apart.filter(is_interval);
+            let seconds = apart.unwrap_or(source.duration_s);
+            is_interval(&seconds).then_some(seconds as f32)
         })
 }
 

@@ -93,8 +93,7 @@ pub struct ObjectsReport {
     /// Number of clusters whose center moves by at least 0.05 m horizontally, ego motion taken out.
     pub moving: usize,
     /// Mean truncated distance of the points of a searched cluster from the target after their
-    /// motion, metres, averaged over the searched clusters. 0 if there was no cluster to search.
-    /// None if a deadline ended the search at its start.
+    /// motion, metres, averaged over the searched clusters. None if no cluster was searched.
     pub cost_m: Option<f64>,
     /// Number of points on the vehicle that carries the sensor: near to it and at rest relative to it.
     /// They have no flow.
@@ -206,8 +205,8 @@ impl Report {
 
     /// The progress at the end of the estimate. For objects: the searched candidates, all
     /// candidates, and their mean cost in metres. For a field: the finished iterations, the
-    /// iteration limit, and the loss of the best iteration. None if a deadline ended the
-    /// search at its start or allowed no iteration.
+    /// iteration limit, and the loss of the best iteration. None if no cluster
+    /// was searched or a deadline allowed no iteration.
     pub fn progress(&self) -> Option<JobProgress> {
         let count = |count: usize| u32::try_from(count).unwrap_or(u32::MAX);
         let (done, total, loss) = match (&self.objects, &self.field) {

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::mpsc::{Receiver, Sender, SyncSender};
 
-use super::io::{At, Io, Loaded, Output, Unread, Wanted};
+use super::io::{At, Before, Io, Loaded, Output, Unread, Wanted};
 use super::layout::tracks_path;
 use super::report::{Outcome, RowReport};
 use super::types::Solver;
@@ -30,8 +30,11 @@ pub(super) enum Tracking {
     NotBegun,
     /// All pairs so far have an estimate.
     Begun(Box<Tracker>),
-    /// A pair has no estimate: the tracks end before it.
+    /// A pair is refused: the tracks end before it, and are written.
     Ended,
+    /// A pair of this drive has failed. The next run begins the drive again, so that its tracks and
+    /// flows do not depend on whether a store failed for a while.
+    Failed(usize),
 }
 
 impl Estimates<'_> {
@@ -44,11 +47,20 @@ impl Estimates<'_> {
     ) {
         let inputs = self.io.inputs;
         let drive = &inputs.plan.drives()[wanted.drive];
+        match self.tracking {
+            Tracking::Failed(failed) if failed == wanted.drive => return,
+            Tracking::Failed(_) => self.tracking = Tracking::NotBegun,
+            _ => {}
+        }
         let [source, target] = [wanted.pair, wanted.pair + 1].map(|at| &drive.sweeps[at].uri);
         let mut report = RowReport::new(drive.key(wanted.pair), source, target);
         let done = self.estimate(wanted, solver, control, &mut report);
         if let Err((outcome, reason)) = done {
             let _the_tally_is_there = self.reports.send(report.ended(outcome, &reason));
+            if inputs.tracks && outcome == Outcome::Failed {
+                self.tracking = Tracking::Failed(wanted.drive);
+                return;
+            }
             if inputs.tracks {
                 let tracking = std::mem::replace(&mut self.tracking, Tracking::Ended);
                 self.write_tracks_of(wanted.drive, tracking);
@@ -116,7 +128,7 @@ impl Estimates<'_> {
                 tracked.map_err(|error| (Outcome::Refused, error.to_string()))?;
             }
         }
-        if wanted.is_there {
+        if wanted.before == Before::Output {
             return Ok(());
         }
         self.put(wanted, &source, &estimate, mask.as_deref(), report.clone());
@@ -126,12 +138,17 @@ impl Estimates<'_> {
     /// Takes the sweeps of a window, and drops those that no later pair needs.
     fn gather(&mut self, wanted: &Wanted, count: usize, size: usize) {
         let range = window(wanted.pair, count, size);
-        self.held = self.held.split_off(&(wanted.drive, range.start));
+        let first = (wanted.drive, range.start);
+        self.held = self.held.split_off(&first);
         let last = (wanted.drive, range.end - 1);
         while !self.held.contains_key(&last) {
             let Ok((at, mut loaded)) = self.read.recv() else {
                 break;
             };
+            // Of a drive that has failed.
+            if at < first {
+                continue;
+            }
             if let Ok(loaded) = &mut loaded {
                 let sweep = std::mem::take(&mut loaded.sweep);
                 loaded.sweep = sweep.prepared(&self.io.inputs.options.solver_options(usize::MAX));
@@ -179,18 +196,20 @@ impl Estimates<'_> {
     ) {
         let output = Output {
             path: wanted.path.clone(),
+            replaces: wanted.before == Before::Untracked,
             bytes: self.io.inputs.layout.bytes(source, estimate, mask),
             report: report.with(estimate),
         };
         let _the_writer_is_there = self.outputs.send(output);
     }
 
-    /// Writes the tracks of a drive. They were written before if they have ended.
+    /// Writes the tracks of a drive, unless they have been written at their end. Those of an earlier
+    /// run, which could not label a pair, are replaced.
     fn write_tracks_of(&self, drive: usize, tracking: Tracking) {
         let tracker = match tracking {
             Tracking::NotBegun => Tracker::default(),
             Tracking::Begun(tracker) => *tracker,
-            Tracking::Ended => return,
+            Tracking::Ended | Tracking::Failed(_) => return,
         };
         let name = &self.io.inputs.plan.drives()[drive].name;
         let mut bytes = Vec::new();
@@ -202,12 +221,14 @@ impl Estimates<'_> {
                 ..RowReport::new(path.clone(), name, name)
             },
             path,
+            replaces: true,
             bytes: written.map(|()| bytes),
         });
     }
 }
 
-/// What became of a pair whose estimate failed.
+/// What became of a pair whose estimate failed. A fit that diverges does so again: its seed is fixed.
 fn failed(error: &FlowError) -> (Outcome, String) {
-    (Outcome::of_trouble(!error.is_input()), error.to_string())
+    let lasts = error.is_input() || matches!(error, FlowError::Diverged { .. });
+    (Outcome::of_trouble(!lasts), error.to_string())
 }

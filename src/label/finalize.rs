@@ -8,7 +8,7 @@ use tokio::runtime::Builder;
 
 use super::error::LabelError;
 use super::layout::{Layout, SETTINGS_FILE, check_outputs, tracks_path};
-use super::places::Place;
+use super::places::{Place, PlaceError};
 use super::plan::Plan;
 use super::report::{Outcome, RowReport, read_lines};
 use super::settings::Settings;
@@ -43,7 +43,8 @@ impl Finalized {
     }
 }
 
-/// Compares the outputs with the plan. Writes `_report.csv`, and `_SUCCESS` where nothing is missing.
+/// Compares the outputs with the plan. Writes `_report.csv`, and `_SUCCESS` where nothing is missing;
+/// otherwise removes it.
 /// `shards` is the number of shards by which missing pairs are named.
 ///
 /// # Errors
@@ -57,7 +58,7 @@ pub fn finalize(
     let runtime = Builder::new_current_thread().enable_all().build()?;
     runtime.block_on(async {
         let settings = Settings::read(output).await?;
-        if settings.layout != layout.name() || settings.plan != plan.hash() {
+        if settings.layout != layout.name() || settings.plan != plan.hash(settings.poses) {
             return Err(LabelError::BadRun(
                 output.uri(SETTINGS_FILE),
                 "it is of another manifest or another layout".to_owned(),
@@ -79,7 +80,8 @@ pub fn finalize(
             }
         }
         let mut found = Finalized::default();
-        let mut missing: HashSet<(usize, usize)> = HashSet::new();
+        let mut missing: BTreeSet<usize> = BTreeSet::new();
+        let before = plan.pairs_before();
         let mut table = csv::Writer::from_writer(Vec::new());
         let heading = [
             "key", "source", "target", "outcome", "error", "seconds", "points", "moving", "overlap",
@@ -106,7 +108,8 @@ pub fn finalize(
                 }
                 (false, None) => {
                     found.missing += 1;
-                    missing.insert((drive, pair));
+                    let number = before[drive] + if whole { 0 } else { pair };
+                    missing.insert(Shard::of(number, plan.pairs(), shards));
                     "missing"
                 }
             };
@@ -128,6 +131,12 @@ pub fn finalize(
         let bytes = table
             .into_inner()
             .map_err(|error| unwritten(error.into_error().into()))?;
+        if !found.is_complete() {
+            match output.remove(SUCCESS).await {
+                Ok(()) | Err(PlaceError::Missing(_)) => {}
+                Err(error) => return Err(error.into()),
+            }
+        }
         output.put(REPORT, Bytes::from(bytes)).await?;
         if found.is_complete() {
             let text = format!(
@@ -137,9 +146,6 @@ pub fn finalize(
             );
             output.put(SUCCESS, Bytes::from(text)).await?;
         } else {
-            let missing = missing.into_iter();
-            let missing = missing.map(|pair| Shard::of(pair, plan, whole, shards));
-            let missing: BTreeSet<usize> = missing.collect();
             let shard = |index| Shard {
                 index,
                 count: shards,

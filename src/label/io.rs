@@ -24,8 +24,19 @@ pub(super) struct Wanted {
     pub(super) pair: usize,
     /// The name of its output.
     pub(super) path: String,
-    /// Whether its output is there: then it is computed for the tracks alone.
-    pub(super) is_there: bool,
+    pub(super) before: Before,
+}
+
+/// What is there of a pair's output before it is computed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Before {
+    /// Nothing.
+    Nothing,
+    /// The output: the pair is computed for the tracks of its drive alone.
+    Output,
+    /// An output without the motions of tracks, because a pair before it could not be labelled: it is
+    /// replaced.
+    Untracked,
 }
 
 /// A sweep of the plan: the indices of its drive and of the sweep.
@@ -48,6 +59,8 @@ pub(super) struct Unread {
 /// An output to be written.
 pub(super) struct Output {
     pub(super) path: String,
+    /// Whether it replaces an output that is there.
+    pub(super) replaces: bool,
     pub(super) bytes: Result<Vec<u8>, FormatError>,
     pub(super) report: RowReport,
 }
@@ -107,7 +120,7 @@ impl Io<'_> {
         }
     }
 
-    /// Writes an output unless it is there, and returns its report.
+    /// Writes an output, unless it is there and not to be replaced, and returns its report.
     pub(super) fn write(&self, output: Output) -> RowReport {
         let bytes = match output.bytes {
             Err(error) => return output.report.ended(Outcome::Refused, &error),
@@ -115,14 +128,19 @@ impl Io<'_> {
         };
         let place = &self.inputs.output;
         let put = || {
-            self.runtime
-                .block_on(place.put_new(&output.path, bytes.clone()))
+            let (path, bytes) = (&output.path, bytes.clone());
+            self.runtime.block_on(async {
+                match output.replaces {
+                    true => place.put(path, bytes).await.map(|()| true),
+                    false => place.put_new(path, bytes).await,
+                }
+            })
         };
         let mut report = output.report;
         match self.patiently(put) {
             Ok(true) => report.outcome = Outcome::Labelled,
             Ok(false) => report.outcome = Outcome::Raced,
-            Err(error) => return report.ended(Outcome::Failed, &error),
+            Err(error) => return report.ended(Outcome::of_trouble(error.may_pass()), &error),
         }
         report
     }

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use super::plan::{Plan, PlanError};
+use super::plan::{Plan, PlanError, below};
 use crate::flow::{Estimate, Point};
 use crate::formats::{
     Av2Challenge, FlowFormat, FlowTable, FormatError, moving_labels, write_av2_challenge,
@@ -52,6 +52,14 @@ impl Layout {
         self == Self::Av2V1
     }
 
+    /// Whether its labels say what moves, or leave the ego motion out.
+    pub fn needs_ego_motion(self) -> bool {
+        match self {
+            Self::SemanticKitti | Self::Av2V1 | Self::Av2V2 | Self::Av2V3 => true,
+            Self::Npz | Self::Feather => false,
+        }
+    }
+
     /// Whether it asks for a pair of a drive, by its index.
     pub(super) fn asks_for(self, pair: usize) -> bool {
         self != Self::Av2V2 || pair.is_multiple_of(V2_STRIDE)
@@ -66,7 +74,7 @@ impl Layout {
                 None => format!("labels/{key}.label"),
             },
             Self::Feather | Self::Av2V1 | Self::Av2V3 => format!("{key}.feather"),
-            Self::Av2V2 => format!("{drive}/{pair:010}.feather"),
+            Self::Av2V2 => below(drive, &format!("{pair:010}.feather")),
         }
     }
 
@@ -138,8 +146,5 @@ pub(super) fn check_outputs(plan: &Plan, layout: Layout, tracks: bool) -> Result
 
 /// The file of a drive's tracks.
 pub(super) fn tracks_path(drive: &str) -> String {
-    match drive.is_empty() {
-        true => "tracks.json".to_owned(),
-        false => format!("{drive}/tracks.json"),
-    }
+    below(drive, "tracks.json")
 }

@@ -190,6 +190,24 @@ impl Place {
         format!("{}/{}", self.base.trim_end_matches('/'), self.path(below))
     }
 
+    /// The folder or prefix that holds it, and its name there; none for the root of a store.
+    pub(super) fn parent(&self) -> Result<Option<(Self, String)>, PlaceError> {
+        if self.base.contains("://") {
+            let (above, name) = self.prefix.rsplit_once('/').unwrap_or(("", &self.prefix));
+            let parent = Self {
+                prefix: above.to_owned(),
+                ..self.clone()
+            };
+            return Ok((!name.is_empty()).then(|| (parent, name.to_owned())));
+        }
+        let path = Path::new(&self.base);
+        let (Some(above), Some(name)) = (path.parent(), path.file_name()) else {
+            return Ok(None);
+        };
+        let parent = Self::open(&above.to_string_lossy())?;
+        Ok(Some((parent, name.to_string_lossy().into_owned())))
+    }
+
     /// A folder below it without links; none in a bucket.
     pub(super) fn without_links(&self, below: &str) -> Option<PathBuf> {
         let is_folder = !self.base.contains("://");
@@ -239,7 +257,9 @@ impl Place {
 
     /// Removes the remains of writes of a run's files that were cut off more than `age` ago.
     pub(super) fn remove_cut_off(&self, age: Duration) -> Result<usize, PlaceError> {
-        const ENDINGS: [&str; 6] = [".npz", ".feather", ".json", ".jsonl", ".csv", "_SUCCESS"];
+        const ENDINGS: [&str; 7] = [
+            ".npz", ".feather", ".label", ".json", ".jsonl", ".csv", "_SUCCESS",
+        ];
         let removed = self.objects.remove_cut_off(&ENDINGS, age);
         removed.map_err(|error| PlaceError::new(&self.uri(""), error))
     }

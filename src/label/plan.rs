@@ -34,11 +34,15 @@ impl Drive {
 
     /// The name of the output of a pair, without its ending.
     pub fn key(&self, pair: usize) -> String {
-        let key = &self.sweeps[pair].key;
-        match self.name.is_empty() {
-            true => key.clone(),
-            false => format!("{}/{key}", self.name),
-        }
+        below(&self.name, &self.sweeps[pair].key)
+    }
+}
+
+/// The name of an output in the folder of its drive. A drive without a name has none.
+pub(super) fn below(drive: &str, name: &str) -> String {
+    match drive.is_empty() {
+        true => name.to_owned(),
+        false => format!("{drive}/{name}"),
     }
 }
 
@@ -120,8 +124,19 @@ impl Plan {
         drives.flat_map(|(drive, of)| (0..of.pairs()).map(move |pair| (drive, pair)))
     }
 
-    /// A hash of all names of outputs and of all sweeps, in order.
-    pub fn hash(&self) -> String {
+    /// The number of pairs before each drive.
+    pub(super) fn pairs_before(&self) -> Vec<usize> {
+        let sums = self.drives.iter().scan(0, |sum, drive| {
+            let before = *sum;
+            *sum += drive.pairs();
+            Some(before)
+        });
+        sums.collect()
+    }
+
+    /// A hash of all that outputs depend on: their names, the sweeps in order, the times, and with
+    /// `poses` the poses.
+    pub fn hash(&self, poses: bool) -> String {
         let mut hasher = blake3::Hasher::new();
         for drive in &self.drives {
             for sweep in &drive.sweeps {
@@ -129,6 +144,16 @@ impl Plan {
                     hasher.update(part.as_bytes());
                     hasher.update(&[0]);
                 }
+                let pose = sweep
+                    .pose
+                    .filter(|_| poses)
+                    .map(|pose| pose.to_homogeneous());
+                let numbers = pose.iter().flatten().chain(&sweep.time_s);
+                for number in numbers {
+                    hasher.update(&number.to_le_bytes());
+                }
+                // What is there is told from what is not.
+                hasher.update(&[u8::from(pose.is_some()), u8::from(sweep.time_s.is_some())]);
             }
         }
         hasher.finalize().to_hex().to_string()

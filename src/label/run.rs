@@ -8,7 +8,7 @@ use tokio::runtime::{Builder, Runtime};
 
 use super::datasets::{Dataset, drives_of};
 use super::error::LabelError;
-use super::io::{Io, Wanted};
+use super::io::{Before, Io, Wanted};
 use super::layout::{check_outputs, tracks_path};
 use super::manifest::read_manifest;
 use super::pipeline::label;
@@ -78,7 +78,7 @@ async fn present(
     Ok(found)
 }
 
-/// The pairs of a shard, and those of them whose outputs are not there.
+/// The number of pairs of a shard, and those of them that are to be computed.
 async fn wanted(inputs: &Inputs<'_>) -> Result<(usize, Vec<Wanted>), LabelError> {
     let (plan, layout) = (inputs.plan, inputs.layout);
     let mut pairs = inputs.shard.pairs(plan, inputs.tracks);
@@ -90,30 +90,48 @@ async fn wanted(inputs: &Inputs<'_>) -> Result<(usize, Vec<Wanted>), LabelError>
         .map(|(drive, pair)| {
             let of = &plan.drives()[drive];
             let path = layout.path(&of.name, pair, &of.key(pair));
-            let is_there = present.contains(&path);
+            let before = match present.contains(&path) {
+                true => Before::Output,
+                false => Before::Nothing,
+            };
             Wanted {
                 drive,
                 pair,
                 path,
-                is_there,
+                before,
             }
         })
         .collect();
     if inputs.tracks {
-        // Tracks need all pairs of a drive: it is done again unless all of it is there.
-        let unfinished: HashSet<usize> = all
-            .iter()
-            .filter(|wanted| {
-                let tracks = tracks_path(&plan.drives()[wanted.drive].name);
-                !wanted.is_there || !present.contains(&tracks)
-            })
-            .map(|wanted| wanted.drive)
+        let has_tracks = |drive: usize| present.contains(&tracks_path(&plan.drives()[drive].name));
+        all = all
+            .chunk_by(|one, next| one.drive == next.drive)
+            .flat_map(|drive| of_tracked_drive(drive, has_tracks(drive[0].drive)))
             .collect();
-        all.retain(|wanted| unfinished.contains(&wanted.drive));
     } else {
-        all.retain(|wanted| !wanted.is_there);
+        all.retain(|wanted| wanted.before == Before::Nothing);
     }
     Ok((total, all))
+}
+
+/// What is to be computed of a drive whose tracks are wanted: nothing if all of it is there, and
+/// otherwise all pairs, because tracks need them. Where there are tracks and a pair is missing, the pair
+/// was refused, the tracks end before it, and the flows after it are without them.
+fn of_tracked_drive(pairs: &[Wanted], has_tracks: bool) -> Vec<Wanted> {
+    let missing = pairs
+        .iter()
+        .position(|wanted| wanted.before == Before::Nothing);
+    if missing.is_none() && has_tracks {
+        return Vec::new();
+    }
+    let mut pairs = pairs.to_vec();
+    let after = missing.filter(|_| has_tracks).unwrap_or(pairs.len());
+    for wanted in &mut pairs[after..] {
+        if wanted.before == Before::Output {
+            wanted.before = Before::Untracked;
+        }
+    }
+    pairs
 }
 
 /// Labels the pairs of a shard whose outputs are not there. When `stop` becomes true, the pair that
@@ -139,9 +157,7 @@ pub fn run(
     let runtime = runtime()?;
     let (total, wanted) = runtime.block_on(async {
         check_conditional_writes(&inputs.output).await?;
-        let flags = [inputs.poses, inputs.tracks];
-        let settings = Settings::new(inputs.plan, inputs.options, inputs.layout, flags);
-        settings.agree(&inputs.output).await?;
+        Settings::new(inputs).agree(&inputs.output).await?;
         for (name, text) in inputs.layout.run_files() {
             inputs.output.put_new(name, (*text).into()).await?;
         }

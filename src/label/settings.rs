@@ -4,9 +4,9 @@ use bytes::Bytes;
 use serde::{Deserialize, Serialize};
 
 use super::error::{LabelError, OtherRun};
-use super::layout::{Layout, SETTINGS_FILE};
+use super::layout::SETTINGS_FILE;
 use super::places::{Place, PlaceError};
-use super::plan::Plan;
+use super::types::Inputs;
 use crate::job::{DeviceChoice, JobOptions};
 
 /// What determines the outputs of a run.
@@ -22,33 +22,31 @@ pub struct Settings {
     pub poses: bool,
     /// Whether tracks are written, and correct the flows.
     pub tracks: bool,
+    /// Where the masks are, for a layout that asks for them.
+    pub masks: Option<String>,
     /// Number of pairs of the plan.
     pub pairs: usize,
-    /// Hash of the plan's names and sweeps.
+    /// [`Plan::hash`](super::Plan::hash).
     pub plan: String,
 }
 
 impl Settings {
     /// The settings of a run of this program.
-    pub fn new(
-        plan: &Plan,
-        options: &JobOptions,
-        layout: Layout,
-        [poses, tracks]: [bool; 2],
-    ) -> Self {
+    pub fn new(inputs: &Inputs<'_>) -> Self {
         let options = JobOptions {
             // Farms have mixed machines. On two devices fields differ by rounding.
             device: DeviceChoice::default(),
-            ..options.clone()
+            ..inputs.options.clone()
         };
         Self {
             fnsf: env!("CARGO_PKG_VERSION").to_owned(),
             options: serde_json::from_str(&options.to_json()).unwrap_or_default(),
-            layout: layout.name().to_owned(),
-            poses,
-            tracks,
-            pairs: plan.pairs(),
-            plan: plan.hash(),
+            layout: inputs.layout.name().to_owned(),
+            poses: inputs.poses,
+            tracks: inputs.tracks,
+            masks: inputs.masks.as_ref().map(|masks| masks.uri("")),
+            pairs: inputs.plan.pairs(),
+            plan: inputs.plan.hash(inputs.poses),
         }
     }
 

@@ -4,7 +4,7 @@ use std::env;
 use std::fmt;
 use std::str::FromStr;
 
-use super::plan::{Drive, Plan};
+use super::plan::Plan;
 
 /// Shard `index` of `count`, counted from 0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -97,48 +97,28 @@ impl Shard {
         Err(ShardError::NotInEnvironment)
     }
 
-    /// The index of the shard of `count` that holds a pair, given by the indices of its drive and of the
-    /// pair.
-    pub(super) fn of(
-        (drive, pair): (usize, usize),
-        plan: &Plan,
-        whole_drives: bool,
-        count: usize,
-    ) -> usize {
-        let before = plan.drives()[..drive]
-            .iter()
-            .map(Drive::pairs)
-            .sum::<usize>();
-        let number = if whole_drives { before } else { before + pair };
-        holder(number, plan.pairs(), count)
+    /// The index of the shard of `count` that holds a pair. `number` is the number of the plan's `all`
+    /// pairs before it, or with whole drives before its drive.
+    pub(super) fn of(number: usize, all: usize, count: usize) -> usize {
+        (number as u128 * count as u128 / all as u128) as usize
     }
 
     /// Its pairs, in order: the indices of the drive and of the pair. Consecutive pairs stay
     /// together, so that a sweep is read once. With `whole_drives` a drive is in one shard.
     pub fn pairs(&self, plan: &Plan, whole_drives: bool) -> Vec<(usize, usize)> {
-        let all = plan.pairs();
-        let is_own = |number: usize| holder(number, all, self.count) == self.index;
-        let mut first = 0;
-        let mut pairs = Vec::new();
-        for (index, drive) in plan.drives().iter().enumerate() {
-            let own = (0..drive.pairs())
-                .filter(|pair| is_own(if whole_drives { first } else { first + pair }));
-            pairs.extend(own.map(|pair| (index, pair)));
-            first += drive.pairs();
-        }
-        pairs
+        let (all, before) = (plan.pairs(), plan.pairs_before());
+        let is_own = |&(drive, pair): &(usize, usize)| {
+            let number = before[drive] + if whole_drives { 0 } else { pair };
+            Self::of(number, all, self.count) == self.index
+        };
+        plan.all_pairs().filter(is_own).collect()
     }
-}
-
-/// The index of the shard that holds number `number` of 0..`all`: each has one part of it.
-fn holder(number: usize, all: usize, count: usize) -> usize {
-    (number as u128 * count as u128 / all as u128) as usize
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::label::plan::DriveSweep;
+    use crate::label::plan::{Drive, DriveSweep};
 
     fn plan(sizes: &[usize]) -> Plan {
         let drive = |(index, &size): (usize, &usize)| Drive {

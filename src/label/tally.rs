@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 
 use super::error::LabelError;
-use super::io::{Io, Wanted};
+use super::io::{Before, Io, Wanted};
 use super::places::PlaceError;
 use super::report::{Outcome, RowReport, lines};
 use super::types::{Done, Told};
@@ -39,7 +39,10 @@ impl<'a> Tally<'a> {
     ) -> Self {
         let shard = io.inputs.shard;
         let attempt = uuid::Uuid::now_v7();
-        let waiting = wanted.iter().filter(|wanted| !wanted.is_there).count();
+        let waiting = wanted
+            .iter()
+            .filter(|wanted| wanted.before != Before::Output)
+            .count();
         Self {
             io,
             reported,

@@ -55,7 +55,7 @@ pub(crate) fn labels(root: &Path) -> BTreeMap<String, Vec<u8>> {
 }
 
 /// Compares labels without printing megabytes.
-fn assert_same(one: &BTreeMap<String, Vec<u8>>, other: &BTreeMap<String, Vec<u8>>) {
+pub(crate) fn assert_same(one: &BTreeMap<String, Vec<u8>>, other: &BTreeMap<String, Vec<u8>>) {
     assert!(
         one.keys().eq(other.keys()),
         "{:?} {:?}",

@@ -173,6 +173,28 @@ fn nuscenes_lies_in_tables() {
         .expect("there")
         .count();
     assert_eq!(report, 1);
+    // A second version beside it: one of them is to be named.
+    let other = folder.join("set/v1.0-trainval");
+    fs::create_dir_all(&other).expect("made");
+    for file in fs::read_dir(folder.join("set/v1.0-mini")).expect("there") {
+        let file = file.expect("a file").path();
+        let name = file.file_name().expect("a name");
+        fs::copy(&file, other.join(name)).expect("copied");
+    }
+    let both = fnsf(folder, &["label", "nuscenes:set", "-o", "both"]);
+    assert_eq!(both.code, 65);
+    let said = "it has v1.0-mini and v1.0-trainval: name the folder of one of them";
+    assert!(both.stderr.contains(said), "{}", both.stderr);
+    let named = [
+        "nuscenes:set/v1.0-trainval",
+        "-o",
+        "named",
+        "--preset",
+        "default",
+    ];
+    label(folder, &named);
+    assert!(folder.join("named/scene-0061").is_dir());
+    fs::remove_dir_all(other).expect("there");
     fs::write(folder.join("set/v1.0-mini/ego_pose.json"), "[{}]").expect("writable");
     let wrong = fnsf(folder, &["label", "set", "-o", "none"]);
     assert_eq!(wrong.code, 65);

@@ -18,6 +18,7 @@ mod label;
 mod label_datasets;
 mod label_hostile;
 mod label_manifest;
+mod label_repair;
 mod laz;
 #[path = "../common/object_server.rs"]
 mod object_server;

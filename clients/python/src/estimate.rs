@@ -6,6 +6,7 @@ use fnsf::flow::field::{Backend, BackendError};
 use fnsf::flow::{
     Estimate, FlowError, MotionField, Options, Point, Problem, Residual, estimate as solve,
 };
+use fnsf::formats::{SweepClock, pair_interval_s};
 use fnsf::job::{JobOptions, Report};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
@@ -168,6 +169,51 @@ pub(crate) fn answer<'py>(
     Ok(answer)
 }
 
+/// The clock of a sweep whose points have times. Points that are not finite count for nothing.
+pub(crate) fn clock_of(points: &[Point], times: &[f32]) -> SweepClock {
+    let measured = points.iter().zip(times);
+    let measured = measured.filter(|(point, _)| point.iter().all(|c| c.is_finite()));
+    let ends = measured.fold(
+        [f32::INFINITY, f32::NEG_INFINITY],
+        |[first, last], (_, &time)| [first.min(time), last.max(time)],
+    );
+    SweepClock {
+        duration_s: f64::from(ends[1]) - f64::from(ends[0]),
+        sweep_s: None,
+    }
+}
+
+/// Seconds between two sweeps by their names and, where points have times, by their duration and the
+/// time on the sensor's clock; none where nothing is known.
+#[pyfunction]
+pub(crate) fn pair_interval(
+    names: [String; 2],
+    clocks: [Option<(f64, Option<f64>)>; 2],
+) -> Option<f32> {
+    let clocks = clocks.map(|clock| {
+        clock.map(|(duration_s, sweep_s)| SweepClock {
+            duration_s,
+            sweep_s,
+        })
+    });
+    pair_interval_s([&names[0], &names[1]], clocks)
+}
+
+/// Refuses what an estimate would refuse of its options, its deadline and its device. The device is
+/// open then.
+#[pyfunction]
+#[pyo3(signature = (options, *, deadline=None, device="auto", threads=None))]
+pub(crate) fn check_options(
+    py: Python<'_>,
+    options: &str,
+    deadline: Option<f64>,
+    device: &str,
+    threads: Option<usize>,
+) -> PyResult<()> {
+    Watch::new(deadline)?;
+    Place::open(py, device, threads, options_of(options)?).map(drop)
+}
+
 /// Estimates the motion of every point of `source`, N x 3 metres, to `target`, M x 3 metres.
 ///
 /// `options` is the JSON object of the service. `masks` and `times` have one row for each point of
@@ -191,7 +237,7 @@ pub(crate) fn estimate<'py>(
     progress: Option<Bound<'py, PyAny>>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let watch = Watch::new(deadline)?;
-    let options = options_of(options)?;
+    let mut options = options_of(options)?;
     let source: Arc<[Point]> = points("pc1", &source)?.into();
     let target: Arc<[Point]> = points("pc2", &target)?.into();
     let counts = [source.len(), target.len()];
@@ -205,6 +251,10 @@ pub(crate) fn estimate<'py>(
         Ok::<_, PyErr>([column("the times of pc1", &first, counts[0])?, second])
     });
     let times = times.transpose()?;
+    if let (None, Some(times)) = (options.dt_s, &times) {
+        let clocks = [clock_of(&source, &times[0]), clock_of(&target, &times[1])];
+        options.dt_s = pair_interval_s(["", ""], clocks.map(Some));
+    }
     let mut problem = Problem::pair(&source, &target);
     problem.ground = masks.as_ref().map(|of| [of[0].as_slice(), &of[1]]);
     problem.times = times.as_ref().map(|of| [of[0].as_slice(), &of[1]]);

@@ -32,6 +32,7 @@ pub(crate) fn read_sweep<'py>(
     let offsets = times.map(|times| from_values(py, &times.offsets_s));
     answer.set_item("times", offsets)?;
     answer.set_item("time", times.and_then(|times| times.sweep_s))?;
+    answer.set_item("duration", times.map(|times| times.duration_s))?;
     Ok(answer)
 }
 

@@ -3,15 +3,17 @@
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
 
+use fnsf::flow::field::Backend;
 use fnsf::flow::tracks::{Tracker, push_and_correct};
-use fnsf::flow::{self, Ego, Estimate, Point, Sweep};
+use fnsf::flow::{self, Ego, Estimate, FlowError, Point, Sweep};
+use fnsf::formats::{SweepClock, pair_interval_s};
 use fnsf::job::JobOptions;
 use pyo3::prelude::*;
 use pyo3::types::PyList;
 
 use crate::arrays::{Mask, Matrix, PointArray, Values, column, motion, points};
 use crate::errors::{Error, input, internal};
-use crate::estimate::{Place, answer, options_of};
+use crate::estimate::{Place, answer, clock_of, options_of};
 use crate::objects;
 use crate::supervision::Watch;
 
@@ -26,8 +28,10 @@ struct State {
     place: Place,
     sequence: flow::Sequence,
     waiting: VecDeque<Waiting>,
-    last: Option<Arc<[Point]>>,
+    last: Option<(Arc<[Point]>, Option<SweepClock>)>,
     tracker: Option<Tracker>,
+    /// Whether estimates were lost by an exception after they were made.
+    is_cut: bool,
 }
 
 /// The estimates of the consecutive pairs of a sequence.
@@ -38,6 +42,9 @@ impl Sequence {
     /// The state. One thread at a time may push.
     fn state(&self) -> PyResult<MutexGuard<'_, State>> {
         match self.0.try_lock() {
+            Ok(state) if state.is_cut => Err(Error::new_err(
+                "an exception ended this sequence: flows that were found by then are lost; begin another one",
+            )),
             Ok(state) => Ok(state),
             Err(TryLockError::Poisoned(state)) => Ok(state.into_inner()),
             Err(TryLockError::WouldBlock) => Err(Error::new_err(
@@ -48,6 +55,23 @@ impl Sequence {
 }
 
 impl State {
+    /// Does `work` on the sequence. Where an exception loses estimates, the sequence has ended.
+    fn run(
+        &mut self,
+        py: Python<'_>,
+        watch: &Watch,
+        progress: Option<&Bound<'_, PyAny>>,
+        work: impl Fn(&mut flow::Sequence, &dyn Backend) -> Result<Vec<Estimate>, FlowError> + Sync,
+    ) -> PyResult<Vec<Estimate>> {
+        let before = self.sequence.position();
+        let sequence = &mut self.sequence;
+        let done = self
+            .place
+            .run(py, watch, progress, |backend| work(sequence, backend));
+        self.is_cut = done.is_err() && self.sequence.position() != before;
+        done
+    }
+
     /// The complete pairs as dictionaries, corrected by the tracks where they are kept.
     fn complete<'py>(
         &mut self,
@@ -55,6 +79,8 @@ impl State {
         estimates: Vec<Estimate>,
         out: &Bound<'py, PyList>,
     ) -> PyResult<()> {
+        // Until all of them are in the list.
+        self.is_cut = true;
         for mut estimate in estimates {
             let pair = self.waiting.pop_front();
             let pair = pair.ok_or_else(|| internal("an estimate without its pair"))?;
@@ -67,6 +93,7 @@ impl State {
             let [source, target] = &pair.sweeps;
             out.append(answer(py, estimate, &pair.options, [source, target])?)?;
         }
+        self.is_cut = false;
         Ok(())
     }
 }
@@ -89,11 +116,13 @@ impl Sequence {
             waiting: VecDeque::new(),
             last: None,
             tracker: track.then(Tracker::default),
+            is_cut: false,
         })))
     }
 
     /// Adds a sweep, N x 3 metres, and returns the pairs that are complete with it. `ego` and `dt_s`
-    /// are those of the pair that has the sweep as its target.
+    /// are those of the pair that has the sweep as its target. Without `dt_s`, points with times give
+    /// the interval.
     #[pyo3(signature = (sweep, *, mask=None, times=None, ego=None, dt_s=None, deadline=None, progress=None))]
     #[expect(
         clippy::too_many_arguments,
@@ -122,19 +151,25 @@ impl Sequence {
             ground: mask.transpose()?,
             times: times.transpose()?,
         };
+        let clock = sweep
+            .times
+            .as_ref()
+            .map(|times| clock_of(&sweep.points, times));
+        let last_clock = state.last.as_ref().and_then(|(_, clock)| *clock);
         let mut options = state.place.options.clone();
-        options.dt_s = dt_s.or(options.dt_s);
+        options.dt_s = dt_s
+            .or(options.dt_s)
+            .or_else(|| pair_interval_s(["", ""], [last_clock, clock]));
         options.check().map_err(input)?;
-        let larger = count.max(state.last.as_ref().map_or(0, |last| last.len()));
+        let larger = count.max(state.last.as_ref().map_or(0, |(last, _)| last.len()));
         let mut solver = options.solver_options(larger);
         if let Some(ego) = ego {
             solver.ego = Ego::Given(motion("ego", &ego)?);
         }
-        let sequence = &mut state.sequence;
-        let estimates = state.place.run(py, &watch, progress.as_ref(), |backend| {
+        let estimates = state.run(py, &watch, progress.as_ref(), |sequence, backend| {
             sequence.push(backend, sweep.clone(), &solver, &watch)
         })?;
-        if let Some(last) = state.last.replace(Arc::clone(&cloud)) {
+        if let Some((last, _)) = state.last.replace((Arc::clone(&cloud), clock)) {
             let sweeps = [last, cloud];
             state.waiting.push_back(Waiting { sweeps, options });
         }
@@ -156,8 +191,7 @@ impl Sequence {
         let state = &mut *state;
         let complete = PyList::empty(py);
         while !state.waiting.is_empty() {
-            let sequence = &mut state.sequence;
-            let estimates = state.place.run(py, &watch, progress.as_ref(), |backend| {
+            let estimates = state.run(py, &watch, progress.as_ref(), |sequence, backend| {
                 sequence.finish(backend, &watch)
             })?;
             if estimates.is_empty() {

@@ -47,6 +47,35 @@ def test_rows_that_cannot_be_used_are_refused(table, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("options", "error", "said"),
+    [
+        ({"preset": "defualt"}, fnsf.InputError, "defualt"),
+        ({"threads": 0}, fnsf.InputError, "threads is 0"),
+        ({"deadline": 0}, fnsf.InputError, "deadline is 0"),
+        ({"device": "gpux"}, fnsf.InputError, "gpux"),
+        ({"times": ([], [])}, TypeError, "times"),
+    ],
+)
+def test_options_that_fit_no_pair_are_refused_at_the_start(tmp_path, options, error, said):
+    with pytest.raises(error, match=said):
+        Labeller(str(tmp_path), **options)
+
+
+def test_the_time_between_sweeps_is_that_of_their_names(street, tmp_path):
+    times = [1532402927647951, 1532402927697951]
+    names = [str(tmp_path / f"n015__LIDAR_TOP__{time}.pcd") for time in times]
+    for index, name in enumerate(names):
+        fnsf.write(name, street.sweep(index).points)
+    for options, dt_s in [({}, 0.05), ({"dt_s": 0.2}, 0.2)]:
+        output = tmp_path / f"labels{dt_s}"
+        labeller = Labeller(str(output), preset="default", **options)
+        assert labeller.label("one", *names)["outcome"] == "labelled"
+        expected = fnsf.flow(street.sweep(0).points, street.sweep(1).points, dt_s=dt_s)
+        velocity = fnsf.read_flow(output / "one.npz").clusters["velocity"]
+        assert np.array_equal(velocity, expected.clusters["velocity"]) and np.abs(velocity).max() > 1
+
+
+@pytest.mark.parametrize(
     "uri",
     [
         "abfss://x@evil.example/c/0.pcd",

@@ -37,6 +37,25 @@ def test_a_flow_comes_back_from_every_format(pair, tmp_path, ending):
         again(pair.source)
 
 
+@pytest.mark.parametrize("ending", ["feather", "ply", "pcd"])
+def test_a_flow_without_clusters_or_points_is_written_as_far_as_a_format_goes(pair, tmp_path, ending):
+    flow = fnsf.flow(pair.source, pair.target)
+    flow.save(tmp_path / f"flow.{ending}")
+    read = fnsf.read_flow(tmp_path / f"flow.{ending}")
+    assert read.clusters is None and read.source is None
+    for other in ["npz", "json"]:
+        read.save(tmp_path / f"again.{other}")
+        again = fnsf.read_flow(tmp_path / f"again.{other}")
+        assert np.array_equal(again.flow, flow.flow) and np.array_equal(again.confidence, flow.confidence)
+        assert (again.cluster == -1).all()
+    read.save(tmp_path / "again.feather")
+    assert np.array_equal(fnsf.read_flow(tmp_path / "again.feather").cluster, flow.cluster)
+    for other in ["ply", "pcd"]:
+        with pytest.raises(fnsf.Error, match="no source points"):
+            read.save(tmp_path / f"none.{other}")
+        assert not (tmp_path / f"none.{other}").exists()
+
+
 def test_a_picture_is_that_of_the_command_line(program, pair, tmp_path):
     np.savez(tmp_path / "pair.npz", pc1=pair.source, pc2=pair.target)
     command = [program, "flow", tmp_path / "pair.npz", "--picture", tmp_path / "theirs.png"]

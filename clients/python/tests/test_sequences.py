@@ -57,6 +57,37 @@ def test_known_motions_and_masks_are_taken(street):
     assert len(refused.push(pair.target)) == 1
 
 
+def test_after_an_exception_no_flow_has_the_sweep_of_another(street):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    sweeps = [street.sweep(index).points for index in range(3)]
+    sequence = fnsf.Sequence(preset="default")
+    sequence.push(sweeps[0])
+    with pytest.raises(KeyboardInterrupt):
+        sequence.push(sweeps[1], progress=interrupted)
+    try:
+        (flow,) = sequence.push(sweeps[1])
+    except fnsf.Error:
+        # The flow had been found, and is lost.
+        with pytest.raises(fnsf.Error, match="ended this sequence"):
+            sequence.finish()
+    else:
+        assert np.array_equal(flow.source, sweeps[0])
+
+
+def test_times_of_points_give_the_time_between_sweeps():
+    street = fnsf.simulate(2, seed=5, beams=16, azimuth_steps=400, rolling=True)
+    sweeps = [street.sweep(index) for index in range(2)]
+    duration = float(np.ptp(sweeps[0].times[np.isfinite(sweeps[0].points).all(axis=1)]))
+    sequence = fnsf.Sequence(preset="default")
+    sequence.push(sweeps[0].points, times=sweeps[0].times)
+    (flow,) = sequence.push(sweeps[1].points, times=sweeps[1].times)
+    alone = fnsf.flow(sweeps[0].points, sweeps[1].points, times=(sweeps[0].times, sweeps[1].times))
+    for found in (flow, alone):
+        assert found.report["dt_s"] == pytest.approx(duration) and duration > 0.05
+
+
 def test_a_dense_cloud_has_the_bits_of_the_command_line(program, street, files, tmp_path):
     command = [program, "densify", *files[:4], "--reference-time", "1.5", "-o", tmp_path / "dense.npz"]
     subprocess.run(command, check=True, capture_output=True)

@@ -2,7 +2,7 @@
 
 use std::cell::LazyCell;
 
-use super::ego_motion::ego_motion;
+use super::ego_motion::{ego_motion, prior};
 use super::method::{Input, Solved};
 use super::result::{FieldSolution, Solution};
 use crate::flow::data::{Hash, Point};
@@ -40,7 +40,7 @@ pub(super) fn residual_motion(
         .transpose()?;
     let [source, target] = [&selection.source, &selection.target].map(|cloud| options.seen(cloud));
     let prepared = field::prepare_target(backend, [&source, &target], options, control)?;
-    let prior = before.and_then(|field| field.ego).unwrap_or_default();
+    let prior = prior(problem, input.options);
     let ego = match (&prepared, input.options.ego) {
         (Some(prepared), ego) => {
             let host = backend.host();

@@ -93,7 +93,10 @@ pub(super) fn residual_motion(
             input.options.dt_s,
         )
     });
-    let own_rows = ego.map_or_else(Vec::new, |ego| objects.take_own(&ego, input.options.dt_s));
+    let own_rows = ego.map_or_else(Vec::new, |ego| {
+        let rows = [problem.source, input.given[0]];
+        objects.take_own(rows, &ego, input.options.dt_s)
+    });
     Ok(Solved {
         residual: search.residual_of(aligned),
         alignment,

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use super::ego_motion::prior;
 use crate::flow::data::{Control, Point, RigidTransform};
 use crate::flow::deskew::{Fit, deskewed};
 use crate::flow::error::FlowError;
@@ -78,7 +79,7 @@ pub(super) fn deskew(
     };
     let ground = ground_of(host, problem, options)?;
     let given = [problem.source, problem.target];
-    let rough = align(given, &RigidTransform::identity());
+    let rough = align(given, &prior(problem, options));
     let motion = &rough.motion;
     let stands =
         motion.translation.vector.norm() < STANDS[0] && motion.rotation.angle() < STANDS[1];

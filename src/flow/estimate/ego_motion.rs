@@ -2,7 +2,8 @@
 
 use crate::flow::data::{Control, EarlierDeadline, Point, RigidTransform, stride_sample};
 use crate::flow::host::Host;
-use crate::flow::options::Ego;
+use crate::flow::options::{Ego, Method, Options};
+use crate::flow::problem::Problem;
 use crate::flow::registration::Registration;
 use crate::flow::select::Selection;
 
@@ -19,6 +20,16 @@ pub(super) fn has_time_for_all(selection: &Selection, control: &dyn Control) -> 
     let points: usize = clouds.map(Vec::len).sum();
     let ample = SECONDS_PER_POINT * points as f64;
     control.seconds_left().is_none_or(|left| left > ample)
+}
+
+/// The initial guess of the ego motion: that of the pair before where the options start from its field,
+/// otherwise the identity. Without a warm start a pair is independent of the others.
+pub(super) fn prior(problem: &Problem, options: &Options) -> RigidTransform {
+    let before = match &options.method {
+        Method::Field(field) => problem.before.filter(|_| field.warm_start.is_some()),
+        Method::Objects(_) => None,
+    };
+    before.and_then(|field| field.ego).unwrap_or_default()
 }
 
 /// The ego motion as target_from_source, with `prior` as the initial guess; none with [`Ego::Off`].

@@ -41,18 +41,26 @@ impl Input<'_> {
             source,
             target,
             undrawn,
+            has_ground,
             ..
         } = self.selection;
         let (ego, ego_covariance) =
             ego.map_or((None, None), |found| (Some(found.motion), found.covariance));
-        let moved = |points: &Vec<Point>| match &ego {
-            None => points.clone(),
+        let moved = |points: &[Point]| match &ego {
+            None => points.to_vec(),
             Some(motion) => transform_points(motion, points),
         };
         let aligned = moved(source);
-        let measure = || match undrawn {
-            None => overlap(&aligned, target),
-            Some([source, target]) => overlap(&moved(source), target),
+        let clouds = undrawn
+            .as_ref()
+            .map_or([source, target], |[source, target]| [source, target]);
+        let measure = || match (has_ground, undrawn) {
+            (false, None) => overlap(&aligned, target),
+            (false, Some([source, target])) => overlap(&moved(source), target),
+            (true, _) => {
+                let [source, target] = off_ground(host, clouds);
+                overlap(&moved(&source), &target)
+            }
         };
         let overlap = match self.control.interrupt() {
             Some(Interrupt::Cancelled) => return Err(FlowError::Cancelled),
@@ -71,6 +79,18 @@ impl Input<'_> {
             }),
         }
     }
+}
+
+/// The points of the source and of the target that are off the ground. All are finite.
+fn off_ground(host: &Host, clouds: [&Vec<Point>; 2]) -> [Vec<Point>; 2] {
+    let masks = host.ground(&clouds.map(Vec::as_slice));
+    let mut masks = masks.into_iter();
+    clouds.map(|points| {
+        let rows = points.iter().zip(masks.next().unwrap_or_default());
+        rows.filter(|(_, is_ground)| !is_ground)
+            .map(|(&point, _)| point)
+            .collect()
+    })
 }
 
 /// The source in the target's frame.

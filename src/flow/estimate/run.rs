@@ -2,6 +2,8 @@
 
 use std::borrow::Cow;
 
+use bytemuck::cast_slice;
+
 use super::by_cluster;
 use super::by_field;
 use super::by_objects;
@@ -85,7 +87,7 @@ fn estimate_from(
     }
     let (problem, options) = (&problem, options.as_ref());
     let find_ground = |sweeps: &[&[Point]]| backend.host().ground(sweeps);
-    let selection = select(problem, options, &find_ground)?;
+    let selection = select(problem, given, options, &find_ground)?;
     let selected_at = control.seconds();
     let input = Input {
         problem,
@@ -183,7 +185,9 @@ fn assemble(input: &Input<'_>, solved: Solved, [began, selected_at]: [f64; 2]) -
         ego_covariance,
         overlap,
         deskew: None,
-        same_sweep: source == input.problem.target,
+        // By bits, because points may be no numbers.
+        same_sweep: cast_slice::<Point, u8>(source)
+            == cast_slice::<Point, u8>(input.problem.target),
         points,
         solution,
         stop_reason: solved.stop_reason,

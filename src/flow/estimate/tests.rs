@@ -2,15 +2,17 @@
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
+use super::ego_motion::prior;
 use super::*;
 use crate::flow::cpu::CpuBackend;
 use crate::flow::data::Control;
 use crate::flow::data::Interrupt;
-use crate::flow::data::Point;
 use crate::flow::data::StopReason;
 use crate::flow::data::transform_point;
+use crate::flow::data::{Point, Random, RigidTransform};
 use crate::flow::data::{Progress, Uncontrolled};
 use crate::flow::error::FlowError;
+use crate::flow::motion::{MotionField, Residual};
 use crate::flow::options::Options;
 use crate::flow::options::{Ego, Ground, Preset};
 use crate::flow::problem::Problem;
@@ -161,4 +163,93 @@ fn a_given_ego_motion_is_taken_as_it_is_and_marks_what_moves_against_it() {
         let expected: Point = core::array::from_fn(|a| to[a] - point[a]);
         assert_eq!(estimate.flow[row], expected);
     }
+}
+
+#[test]
+fn identical_sweeps_are_noticed_though_some_of_their_points_are_no_numbers() {
+    let pair = street();
+    let mut sweep = pair.source.clone();
+    sweep[7] = [f32::NAN; 3];
+    let backend = CpuBackend::new(Some(2)).expect("threads");
+    let problem = Problem::pair(&sweep, &sweep);
+    let options = Preset::Default.options(None);
+    let found = estimate(&backend, &problem, &options, &Uncontrolled).expect("a flow");
+    assert!(found.same_sweep);
+}
+
+#[test]
+fn sweeps_of_a_map_s_frame_are_refused_by_name() {
+    let pair = street();
+    let shifted = |points: &[Point]| -> Vec<Point> {
+        points
+            .iter()
+            .map(|&[x, y, z]| [x + 200_000.0, y, z])
+            .collect()
+    };
+    let (source, target) = (shifted(&pair.source), shifted(&pair.target));
+    let backend = CpuBackend::new(Some(2)).expect("threads");
+    let problem = Problem::pair(&source, &target);
+    let options = Preset::Default.options(None);
+    let refused = estimate(&backend, &problem, &options, &Uncontrolled).expect_err("far away");
+    assert!(matches!(
+        refused,
+        FlowError::NotSensorFrame {
+            cloud: "source",
+            ..
+        }
+    ));
+    assert!(refused.to_string().contains("200 km"), "{refused}");
+}
+
+#[test]
+fn ground_that_is_kept_is_no_overlap_of_two_scenes() {
+    let other = StreetOptions {
+        beams: 16,
+        azimuth_steps: 500,
+        seed: 1,
+        ..StreetOptions::default()
+    };
+    let other = Street::new(&other).and_then(|street| street.pair(0));
+    let (pair, other) = (street(), other.expect("a small street"));
+    let backend = CpuBackend::new(Some(2)).expect("threads");
+    let problem = Problem::pair(&pair.source, &other.target);
+    let overlaps = [Ground::Auto, Ground::Keep].map(|ground| {
+        let mut options = Preset::Default.options(None);
+        options.ground = ground;
+        match estimate(&backend, &problem, &options, &Uncontrolled) {
+            Err(FlowError::NoOverlap { overlap }) => overlap,
+            other => panic!("{ground:?}: {:?}", other.map(|found| found.overlap)),
+        }
+    });
+    assert_eq!(overlaps[0], overlaps[1]);
+}
+
+#[test]
+fn a_tower_of_points_takes_no_longer_than_others() {
+    // Every point would be compared with all others: 4e10 distances, several times.
+    let mut random = Random::new(3);
+    let mut point = || [0.7, 0.7, 1500.0].map(|side| random.uniform(0.0, side) as f32);
+    let tower: Vec<Point> = (0..200_000).map(|_| point()).collect();
+    let backend = CpuBackend::new(Some(2)).expect("threads");
+    let problem = Problem::pair(&tower, &tower);
+    let options = Preset::Default.options(None);
+    let found = estimate(&backend, &problem, &options, &Uncontrolled).expect("a flow");
+    assert_eq!(found.flow.len(), tower.len());
+}
+
+#[test]
+fn only_a_warm_start_begins_with_the_ego_motion_of_the_pair_before() {
+    let motion = RigidTransform::translation(-1.0, 0.0, 0.0);
+    let before = MotionField {
+        ego: Some(motion),
+        residual: Residual::Still,
+    };
+    let problem = Problem {
+        before: Some(&before),
+        ..Problem::pair(&[], &[])
+    };
+    let of = |preset: Preset| prior(&problem, &preset.options(None));
+    assert_eq!(of(Preset::Neural), motion);
+    assert_eq!(of(Preset::Default), RigidTransform::identity());
+    assert_eq!(of(Preset::Paper), RigidTransform::identity());
 }

@@ -147,16 +147,20 @@ impl TrackingPool {
     /// Matches, switches, distance and MOTA. A match of the sweep before is kept as long as it is
     /// near enough; the others are assigned with the least sum of distances.
     fn clear_mot(&self, metrics: &mut TrackingMetrics) {
+        // The last match of each object, and those of the sweep before.
         let mut last: BTreeMap<u32, u32> = BTreeMap::new();
+        let mut previous: BTreeMap<u32, u32> = BTreeMap::new();
         let mut distance = 0.0;
         for sweep in &self.sweeps {
             let weights = |t: &TrackedObject, f: &TrackedObject| {
-                let is_kept = last.get(&t.id) == Some(&f.id) && similarity(t, f) > 0.0;
+                let is_kept = previous.get(&t.id) == Some(&f.id) && similarity(t, f) > 0.0;
                 similarity(t, f) + if is_kept { KEPT } else { 0.0 }
             };
             let matched = assign(&sweep.truth, &sweep.found, weights);
+            previous.clear();
             for (truth, found) in matched {
                 let (truth, found) = (&sweep.truth[truth], &sweep.found[found]);
+                previous.insert(truth.id, found.id);
                 let before = last.insert(truth.id, found.id);
                 metrics.switches += usize::from(before.is_some_and(|id| id != found.id));
                 metrics.matches += 1;
@@ -366,6 +370,23 @@ mod tests {
         assert!((metrics.idf1 - 0.75).abs() < 1e-12);
         // Detection is right. Association: 10 of 20 at 1, two times 5 of 20 at 1/2.
         assert!((metrics.hota - 0.75_f64.sqrt()).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_match_is_kept_from_the_sweep_before_and_from_no_earlier_one() {
+        let sweep = |found| TrackedSweep {
+            truth: vec![at(1, 0.0)],
+            ignored: Vec::new(),
+            found,
+        };
+        let both = || vec![at(8, 1.9), at(7, 0.1)];
+        let first = || vec![at(8, 0.0)];
+        let kept = metrics(&[sweep(first()), sweep(both())]);
+        assert_eq!(kept.switches, 0);
+        assert!((kept.distance_m - 0.95).abs() < 1e-6);
+        let lost = metrics(&[sweep(first()), sweep(Vec::new()), sweep(both())]);
+        assert_eq!(lost.switches, 1);
+        assert!((lost.distance_m - 0.05).abs() < 1e-6);
     }
 
     #[test]

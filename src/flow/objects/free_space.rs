@@ -105,8 +105,9 @@ impl Columns {
     fn new(points: &[Point], times: &[f32], path: &Screw) -> Self {
         let mut sums = vec![[0.0_f64; 2]; AZIMUTHS];
         for (&point, &time) in points.iter().zip(times) {
-            if point.iter().all(|c| c.is_finite()) {
-                let sum = &mut sums[direction(point).0 / ELEVATIONS];
+            let (angle, range_m) = direction(point);
+            if range_m.is_finite() && range_m >= NEAREST_M {
+                let sum = &mut sums[angle / ELEVATIONS];
                 *sum = [sum[0] + f64::from(time), sum[1] + 1.0];
             }
         }
@@ -228,9 +229,12 @@ mod tests {
     fn rays_of_a_moving_sensor_begin_where_it_was() {
         // The sensor moves 2 m to the left in an interval, and looks ahead at the middle of it: it
         // sees the pole 1 m to the right of where it is.
-        let raw = sweep(0.0);
+        let mut raw = sweep(0.0);
         let path = RigidTransform::translation(0.0, 2.0, 0.0);
-        let times = vec![0.5; raw.len()];
+        let mut times = vec![0.5; raw.len()];
+        // Some drivers write the origin where there is no return.
+        raw.extend(vec![[0.0; 3]; 10_000]);
+        times.extend(vec![0.0; 10_000]);
         let sweeps = [raw.as_slice(); 2];
         let free_space = FreeSpace::new(sweeps, Some([&times; 2]), &path.inverse());
         let at = |y| -> Vec<Point> { (0..6_i8).map(|i| [10.0, y, f32::from(i) * 0.1]).collect() };

@@ -15,6 +15,10 @@ pub const CERTAIN_OVERLAP: f32 = 0.6;
 /// Largest median distance of a sweep's points from their middle, metres. Lidars reach 300 m.
 pub const MAX_SPREAD_M: f32 = 1000.0;
 
+/// Distance of the middle of a sweep from its origin, metres, above which its frame is no sensor's.
+/// Single precision has steps of 4 mm there.
+pub const MAX_AWAY_M: f32 = 50_000.0;
+
 /// Options of one estimate. Start from a [`super::Preset`] and change single values.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Options {

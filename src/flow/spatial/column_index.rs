@@ -6,7 +6,7 @@
 use super::column_kernels::{Wanted, each_level, each_near, nearest};
 use super::slots::{MOST_LANES, Slots, padded};
 use super::tiles::Tiles;
-use crate::flow::data::Point;
+use crate::flow::data::{Point, stride_sample};
 use crate::flow::simd::Isa;
 
 /// Factor on a radius that covers its rounding.
@@ -39,6 +39,22 @@ impl ColumnIndex {
         *points = (0..points.len()).map(|slot| index.point(slot)).collect();
         index.rows = (0..points.len() as u32).collect();
         index
+    }
+
+    /// The input rows, in ascending order, without those that crowd a column: of a column with more
+    /// than `most` points, `most` are left, evenly chosen. None where no column has more.
+    ///
+    /// A query looks at all points of a column, however high they lie. A tower of points, which no
+    /// sensor sees, would make the cost of all queries quadratic.
+    pub(crate) fn uncrowded_rows(&self, most: usize) -> Option<Vec<u32>> {
+        let columns = self.slots.tiles.begins().windows(2);
+        let columns = columns.map(|ends| &self.rows[ends[0] as usize..ends[1] as usize]);
+        if columns.clone().all(|rows| rows.len() <= most) {
+            return None;
+        }
+        let mut rows: Vec<u32> = columns.flat_map(|rows| stride_sample(rows, most)).collect();
+        rows.sort_unstable();
+        Some(rows)
     }
 
     /// Number of points.

@@ -31,6 +31,8 @@ class Sweep:
     """N seconds after the sweep's time, where the file has them."""
     time: float | None = None
     """The sweep's time on the sensor's clock, seconds, where the file has it."""
+    duration: float | None = None
+    """Seconds from the first point to the last, where points have times."""
 
     def __len__(self) -> int:
         return len(self.points)

@@ -90,9 +90,18 @@ class Flow:
         return self._written_as(f"flow.{ending}")
 
     def _written_as(self, name: str) -> bytes:
+        ending = os.path.splitext(name)[1].lower()
+        if self.source is None and ending in (".ply", ".pcd"):
+            raise _native.Error(
+                f"this flow has no source points, which {ending} files hold: save it as .npz, .npy, .feather or .json"
+            )
         objects = None
         if self.cluster is not None and self.confidence is not None and self.moving is not None:
-            objects = (self.cluster, self.confidence, self.moving, self._clusters())
+            cluster = self.cluster
+            if self.clusters is None and ending in (".npz", ".json"):
+                # These formats describe the clusters that they number.
+                cluster = np.full_like(cluster, -1)
+            objects = (cluster, self.confidence, self.moving, self._clusters())
         return _native.write_flow(name, self._columns(), objects)
 
     def picture(self, path: str | os.PathLike[str]) -> None:
@@ -152,7 +161,8 @@ def flow(
         max_points: points that get a flow, drawn at random from a larger cloud.
         crop_m: half the side of a square about the sensor, metres; points outside take no part.
         min_range_m: points nearer to the sensor than this, metres, take no part.
-        dt_s: seconds between the sweeps, for velocities; 0.1 where not given.
+        dt_s: seconds between the sweeps, for velocities and for deskewing. Where not given, the time from the first
+            point of the source to the last, because a spinning lidar does not pause; 0.1 without `times`.
         times: N and M seconds after the sweeps' times, with which sweeps are deskewed where they fit better then.
         deadline: seconds, after which the best flow so far is returned.
         threads: CPU threads, 1 to 256; all cores where not given. The result does not depend on it.
@@ -201,3 +211,15 @@ def flow(
         progress=progress,
     )
     return of_answer(answer)
+
+
+def check(
+    *,
+    deadline: float | None = None,
+    threads: int | None = None,
+    device: str = "auto",
+    **options: Any,
+) -> None:
+    """Raises what `flow` raises for options that can be used with no pair. The device is open then."""
+    known = _options.as_json({"preset": "default", **options})
+    _native.check_options(known, deadline=deadline, device=device, threads=threads)

@@ -74,6 +74,12 @@ def object_types() -> tuple[np.dtype[Any], np.dtype[Any]]: ...
 def device_name(name: str, threads: int | None = None) -> str:
     """The name of a device as reports show it. It is opened if it is not open yet."""
 
+def pair_interval(
+    names: tuple[str, str], clocks: tuple[tuple[float, float | None] | None, tuple[float, float | None] | None]
+) -> float | None: ...
+def check_options(
+    options: str, *, deadline: float | None = None, device: str = "auto", threads: int | None = None
+) -> None: ...
 def estimate(
     source: _Points,
     target: _Points,

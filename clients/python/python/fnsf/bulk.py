@@ -22,7 +22,7 @@ import numpy as np
 
 from . import _native
 from ._files import MAX_FILE, Sweep
-from ._flow import flow
+from ._flow import check, flow
 
 COLUMNS = ("key", "source", "target", "outcome", "error", "seconds", "points", "moving")
 """The columns of the report."""
@@ -64,6 +64,7 @@ class Labeller:
     def __init__(self, output: str, *, ending: str = "npz", **options: Any) -> None:
         if ending not in ENDINGS:
             raise _native.InputError(f"labels are {', '.join(ENDINGS)}, not {ending}")
+        check(**options)
         self._output, self._ending, self._options = output.rstrip("/"), ending, options
 
     def __call__(self, batch: Mapping[str, Any]) -> dict[str, Any]:
@@ -89,7 +90,11 @@ class Labeller:
             times = None
             if first.times is not None and second.times is not None:
                 times = (first.times, second.times)
-            found = flow(first.points, second.points, times=times, **self._options)
+            options = self._options
+            if options.get("dt_s") is None:
+                clocks = (_clock(first), _clock(second))
+                options = options | {"dt_s": _native.pair_interval((source, target), clocks)}
+            found = flow(first.points, second.points, times=times, **options)
             written = _put_new(path, found.to_bytes(self._ending))
         except REFUSED as error:
             return report | {"outcome": "refused", "error": str(error)}
@@ -135,6 +140,11 @@ def _sweep(uri: str) -> Sweep:
         raise _native.InputError(f"{uri} is no file of at most {MAX_FILE} bytes")
     with filesystem.open_input_file(path) as file:
         return Sweep(**_native.read_sweep(file.read(about.size), uri))
+
+
+def _clock(sweep: Sweep) -> tuple[float, float | None] | None:
+    """The duration of a sweep and its time, seconds; none where its points have no times."""
+    return None if sweep.duration is None else (sweep.duration, sweep.time)
 
 
 def _put_new(uri: str, data: bytes) -> bool:
