@@ -109,8 +109,8 @@ impl From<FitError> for FlowError {
 impl FlowError {
     /// Whether the input or its options caused the error, rather than the machine.
     ///
-    /// True for sweeps of two scenes, coordinates that are not metres or far from the sensor, too few points, a missing
-    /// ground mask or one of the wrong length, times of the wrong length, an empty target,
+    /// True for sweeps of two scenes, coordinates that are not metres or not those of a sensor's frame,
+    /// too few points, a missing ground mask or one of the wrong length, times of the wrong length, an empty target,
     /// clouds that span too much space, a pair that exceeds the allowed memory or the memory of the
     /// device, and an option that the device does not support. False for all other errors,
     /// including an invalid cell or band of the distance transform.

@@ -49,8 +49,8 @@ pub(crate) fn find_ground(sweeps: &[&[Point]]) -> Vec<Vec<bool>> {
 /// of its positions are.
 ///
 /// # Errors
-/// [`FlowError`] where coordinates are not metres or not those of a sensor's frame, a mask is missing or has another length, or fewer
-/// than [`MIN_POINTS`] points of a cloud remain.
+/// [`FlowError`] where coordinates are not metres or not those of a sensor's frame, a mask is missing or
+/// has another length, or fewer than [`MIN_POINTS`] points of a cloud remain.
 pub(crate) fn select(
     problem: &Problem,
     given: [&[Point]; 2],

@@ -2,6 +2,7 @@
 //! envelope of binary formats.
 
 mod aligned_sweep;
+mod angle;
 mod codec;
 pub(crate) mod control;
 mod dense_cloud;
@@ -27,6 +28,7 @@ pub use point::{DYNAMIC_M, MIN_POINTS, Point, RigidTransform};
 pub use rigid_motion::rigid_motion_between;
 pub use stop_reason::StopReason;
 
+pub(crate) use angle::atan2;
 pub(crate) use codec::{Body, Envelope, Hash};
 #[cfg(feature = "gpu")]
 pub(crate) use largest::largest;

@@ -7,7 +7,7 @@
 
 use std::f32::consts::{FRAC_PI_2, PI};
 
-use crate::flow::data::{Point, RigidTransform, Screw, transform_point};
+use crate::flow::data::{Point, RigidTransform, Screw, atan2, transform_point};
 
 /// Sides of the solid angles that rays are binned into, radians. Two rings of a 64-beam lidar fall
 /// into one bin.
@@ -171,11 +171,11 @@ pub(super) fn passed_m(range_m: f32) -> f32 {
 
 /// The bin of a position's direction, and its range, metres.
 fn direction([x, y, z]: Point) -> (usize, f32) {
-    let level = x.hypot(y);
-    let azimuth = ((y.atan2(x) + PI) / AZIMUTH) as usize;
-    let elevation = ((z.atan2(level) + FRAC_PI_2) / ELEVATION) as usize;
+    let square = x * x + y * y;
+    let azimuth = ((atan2(y, x) + PI) / AZIMUTH) as usize;
+    let elevation = ((atan2(z, square.sqrt()) + FRAC_PI_2) / ELEVATION) as usize;
     let angle = azimuth.min(AZIMUTHS - 1) * ELEVATIONS + elevation.min(ELEVATIONS - 1);
-    (angle, level.hypot(z))
+    (angle, (square + z * z).sqrt())
 }
 
 /// The share that rays passed, of the positions with rays toward them; none where there are too

@@ -44,7 +44,7 @@ pub struct Options {
     /// Handling of the ego motion.
     pub ego: Ego,
     /// Whether pairs are estimated that are otherwise refused as nonsense: sweeps that do not show
-    /// one scene, and coordinates that are not metres.
+    /// one scene, coordinates that are not metres, and sweeps far from the origin of their frame.
     pub force: bool,
     /// Whether sweeps with times are deskewed even where they do not fit better then.
     pub always_deskew: bool,

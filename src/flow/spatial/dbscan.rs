@@ -32,7 +32,7 @@ pub(crate) const NOISE: u32 = u32::MAX;
 pub(crate) fn clusters(points: &[Point], radius_m: f32, least: usize) -> Vec<u32> {
     let grid = Cells::new(points, radius_m / 3_f32.sqrt());
     let square = radius_m * radius_m;
-    let cores: Vec<Cow<'_, [u32]>> = (0..grid.len())
+    let chosen: Vec<Cow<'_, [u32]>> = (0..grid.len())
         .into_par_iter()
         .map(|cell| {
             let members = grid.members(cell);
@@ -45,13 +45,14 @@ pub(crate) fn clusters(points: &[Point], radius_m: f32, least: usize) -> Vec<u32
             }
         })
         .collect();
+    let cores = CorePoints::new(points, &chosen);
     let root = connected(&grid, &cores, square);
     // A core point takes the set of its cell, any other point that of the nearest core point.
     let mut labels = vec![NOISE; points.len()];
     let mut others: Vec<(usize, u32)> = Vec::new();
     for (cell, &root) in root.iter().enumerate() {
         let members = grid.members(cell);
-        let mut cores = cores[cell].iter().peekable();
+        let mut cores = chosen[cell].iter().peekable();
         for &row in members {
             if members.len() >= least || cores.next_if_eq(&&row).is_some() {
                 labels[row as usize] = root;
@@ -60,12 +61,12 @@ pub(crate) fn clusters(points: &[Point], radius_m: f32, least: usize) -> Vec<u32
             }
         }
     }
-    let distance = |a: u32, b: u32| square_distance(points[a as usize], points[b as usize]);
     let beside = |&(cell, row): &(usize, u32)| {
+        let position = points[row as usize];
         let mut best = (f32::INFINITY, NOISE);
-        for other in grid.within(cell) {
-            for &core in cores[other].iter() {
-                let far = distance(row, core);
+        for other in grid.near(cell).flatten() {
+            for &core in cores.of(other) {
+                let far = square_distance(position, core);
                 if far <= square && far < best.0 {
                     best = (far, root[other]);
                 }
@@ -81,17 +82,44 @@ pub(crate) fn clusters(points: &[Point], radius_m: f32, least: usize) -> Vec<u32
     labels
 }
 
+/// The core points, cell by cell.
+struct CorePoints {
+    points: Vec<Point>,
+    /// Index of the first core point of each cell, and the number of core points at the end.
+    begins: Vec<u32>,
+}
+
+impl CorePoints {
+    /// `chosen` are the rows of the core points of each cell.
+    fn new(points: &[Point], chosen: &[Cow<'_, [u32]>]) -> Self {
+        let mut all = Vec::with_capacity(points.len());
+        let mut begins = Vec::with_capacity(chosen.len() + 1);
+        for rows in chosen {
+            begins.push(all.len() as u32);
+            all.extend(rows.iter().map(|&row| points[row as usize]));
+        }
+        begins.push(all.len() as u32);
+        Self {
+            points: all,
+            begins,
+        }
+    }
+
+    fn of(&self, cell: usize) -> &[Point] {
+        &self.points[self.begins[cell] as usize..self.begins[cell + 1] as usize]
+    }
+
+    /// Whether a core point of one cell is within the radius of one of the other.
+    fn touch(&self, cell: usize, other: usize, square: f32) -> bool {
+        let others = self.of(other);
+        let is_near = |&a: &Point| others.iter().any(|&b| square_distance(a, b) <= square);
+        self.of(cell).iter().any(is_near)
+    }
+}
+
 /// Of each cell the root of its set. Cells are in one set if a chain of core points, each within the
 /// radius of the next, connects them.
-fn connected(grid: &Cells<'_>, cores: &[Cow<'_, [u32]>], square: f32) -> Vec<u32> {
-    let touches = |cell: usize, other: usize| {
-        let distance = |a: u32, b: u32| {
-            let [a, b] = [a, b].map(|row| grid.points[row as usize]);
-            square_distance(a, b)
-        };
-        let near = |&a: &u32| cores[other].iter().any(|&b| distance(a, b) <= square);
-        cores[cell].iter().any(near)
-    };
+fn connected(grid: &Cells, cores: &CorePoints, square: f32) -> Vec<u32> {
     // The relation is symmetric, so later cells suffice. Cells that are connected already are not
     // compared, which spares most pairs.
     let part = grid.len().div_ceil(PARTS).max(1);
@@ -102,15 +130,17 @@ fn connected(grid: &Cells<'_>, cores: &[Cow<'_, [u32]>], square: f32) -> Vec<u32
             let end = (first + part).min(grid.len());
             let mut inside = Sets::new(end.saturating_sub(first));
             let mut across = Vec::new();
-            for cell in (first..end).filter(|&cell| !cores[cell].is_empty()) {
-                for other in grid.within(cell).filter(|&other| other > cell) {
-                    if other >= end {
-                        if touches(cell, other) {
-                            across.push((cell, other));
+            for cell in (first..end).filter(|&cell| !cores.of(cell).is_empty()) {
+                for near in grid.near(cell) {
+                    for other in near.start.max(cell + 1)..near.end {
+                        if other >= end {
+                            if cores.touch(cell, other, square) {
+                                across.push((cell, other));
+                            }
+                            continue;
                         }
-                    } else {
                         let [a, b] = [cell, other].map(|cell| (cell - first) as u32);
-                        if inside.root(a) != inside.root(b) && touches(cell, other) {
+                        if inside.root(a) != inside.root(b) && cores.touch(cell, other, square) {
                             inside.join(a, b);
                         }
                     }
@@ -154,12 +184,13 @@ fn renumber(labels: &mut [u32], roots: usize) {
 }
 
 /// Points in cubic cells.
-struct Cells<'a> {
-    points: &'a [Point],
+struct Cells {
     /// Key of each cell and the index of its first member in `rows`, sorted by key. A sentinel closes
     /// the list.
     cells: Vec<(u64, u32)>,
     rows: Vec<u32>,
+    /// The points of `rows`.
+    sorted: Vec<Point>,
     columns: Vec<Column>,
     /// The column of each cell.
     column_of: Vec<u32>,
@@ -172,16 +203,18 @@ struct Column {
     cells: Range<u32>,
     /// For each x from two cells before to two cells after, the columns from two cells before to two
     /// cells after in y.
-    around: [Range<u32>; 5],
+    around: [Range<u32>; AROUND],
 }
 
 /// Bound on a cell's index along an axis, on each side of the origin.
 const REACH: f32 = (1 << 20) as f32 - 4.0;
+/// Cells along an axis that may hold points within the radius of those of the middle one.
+const AROUND: usize = 5;
 /// Bits of a key for each axis; the height has the lowest.
 const HEIGHT: u64 = 21;
 
-impl<'a> Cells<'a> {
-    fn new(points: &'a [Point], side_m: f32) -> Self {
+impl Cells {
+    fn new(points: &[Point], side_m: f32) -> Self {
         // Points out of range belong to no cell.
         let in_reach = |&row: &u32| {
             let point = points[row as usize];
@@ -205,17 +238,17 @@ impl<'a> Cells<'a> {
             next += core::mem::replace(members, next);
         }
         cells.push((u64::MAX, next));
-        let mut sorted = vec![0; rows.len()];
+        let mut in_cells = vec![0; rows.len()];
         for (&row, &key) in rows.iter().zip(&keys) {
             let place = table.entry(key);
-            sorted[*place as usize] = row;
+            in_cells[*place as usize] = row;
             *place += 1;
         }
         let (columns, column_of) = columns(&cells[..cells.len() - 1]);
         Self {
-            points,
             cells,
-            rows: sorted,
+            sorted: in_cells.iter().map(|&row| points[row as usize]).collect(),
+            rows: in_cells,
             columns,
             column_of,
         }
@@ -227,39 +260,55 @@ impl<'a> Cells<'a> {
     }
 
     fn members(&self, cell: usize) -> &[u32] {
-        &self.rows[self.cells[cell].1 as usize..self.cells[cell + 1].1 as usize]
+        &self.rows[self.places(&(cell..cell + 1))]
     }
 
-    /// The cells that may hold points within the radius of this cell's points, this cell included,
-    /// in ascending order.
-    fn within(&self, cell: usize) -> impl Iterator<Item = usize> {
+    /// The places of the members of some cells in `rows`.
+    fn places(&self, cells: &Range<usize>) -> Range<usize> {
+        self.cells[cells.start].1 as usize..self.cells[cells.end].1 as usize
+    }
+
+    /// The cells that may hold points within the radius of this cell's points, this cell included:
+    /// ranges in ascending order, one for each column that has some.
+    fn near(&self, cell: usize) -> impl Iterator<Item = Range<usize>> {
         let height = |key: u64| key & ((1 << HEIGHT) - 1);
         let z = height(self.cells[cell].0);
         let around = &self.columns[self.column_of[cell] as usize].around;
         let columns = around
             .iter()
             .flat_map(|range| &self.columns[range.start as usize..range.end as usize]);
-        columns.flat_map(move |column| {
+        columns.filter_map(move |column| {
             let range = column.cells.start as usize..column.cells.end as usize;
             let cells = &self.cells[range.clone()];
-            let low = range.start + cells.partition_point(|&(key, _)| height(key) + 2 < z);
-            let is_near = move |&cell: &usize| height(self.cells[cell].0) <= z + 2;
-            (low..range.end).take_while(is_near)
+            let low = cells.partition_point(|&(key, _)| height(key) + 2 < z);
+            let near = cells[low..].iter();
+            let count = near.take_while(|&&(key, _)| height(key) <= z + 2).count();
+            let low = range.start + low;
+            (count > 0).then(|| low..low + count)
         })
     }
 
     /// The core points among a cell's members: those with `least` points within the radius.
     fn cores(&self, cell: usize, square: f32, least: usize) -> Vec<u32> {
-        let is_core = |&row: &u32| {
-            let near = self.within(cell).flat_map(|other| self.members(other));
-            near.filter(|&&other| {
-                square_distance(self.points[row as usize], self.points[other as usize]) <= square
-            })
-            .take(least)
-            .count()
-                >= least
+        let mut near = [const { 0..0 }; AROUND * AROUND];
+        for (places, cells) in near.iter_mut().zip(self.near(cell)) {
+            *places = self.places(&cells);
+        }
+        let is_core = |place: &usize| {
+            let position = self.sorted[*place];
+            let mut left = least;
+            for places in &near {
+                for &other in &self.sorted[places.clone()] {
+                    left -= usize::from(square_distance(position, other) <= square);
+                    if left == 0 {
+                        return true;
+                    }
+                }
+            }
+            false
         };
-        self.members(cell).iter().copied().filter(is_core).collect()
+        let places = self.places(&(cell..cell + 1)).filter(is_core);
+        places.map(|place| self.rows[place]).collect()
     }
 }
 
@@ -325,103 +374,4 @@ impl Sets {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::flow::data::Random;
-
-    /// DBSCAN by its definition: the core flags, and the labels of the core points. All other
-    /// points are labelled noise.
-    fn by_definition(points: &[Point], radius_m: f32, least: usize) -> (Vec<bool>, Vec<u32>) {
-        let near =
-            |a: usize, b: usize| square_distance(points[a], points[b]) <= radius_m * radius_m;
-        let count = |a: usize| (0..points.len()).filter(|&b| near(a, b)).count();
-        let core: Vec<bool> = (0..points.len()).map(|a| count(a) >= least).collect();
-        let mut labels = vec![NOISE; points.len()];
-        let mut clusters = 0;
-        for seed in 0..points.len() {
-            if !core[seed] || labels[seed] != NOISE {
-                continue;
-            }
-            let mut open = vec![seed];
-            labels[seed] = clusters;
-            while let Some(a) = open.pop() {
-                for b in 0..points.len() {
-                    if core[b] && labels[b] == NOISE && near(a, b) {
-                        labels[b] = clusters;
-                        open.push(b);
-                    }
-                }
-            }
-            clusters += 1;
-        }
-        (core, labels)
-    }
-
-    #[test]
-    fn cores_are_clustered_as_defined_and_others_join_a_core_within_the_radius() {
-        for (seed, side) in [(1, 3.0), (2, 5.0), (3, 8.0)] {
-            let mut random = Random::new(seed);
-            let mut point = || [0; 3].map(|_| random.uniform(0.0, side) as f32);
-            let points: Vec<Point> = (0..400).map(|_| point()).collect();
-            let (core, expected) = by_definition(&points, 0.5, 4);
-            let found = clusters(&points, 0.5, 4);
-            let cores: Vec<usize> = (0..points.len()).filter(|&i| core[i]).collect();
-            for &a in &cores {
-                for &b in &cores {
-                    assert_eq!(found[a] == found[b], expected[a] == expected[b]);
-                }
-            }
-            for i in (0..points.len()).filter(|&i| !core[i]) {
-                let beside = cores
-                    .iter()
-                    .filter(|&&c| square_distance(points[i], points[c]) <= 0.25);
-                let beside: Vec<u32> = beside.map(|&c| found[c]).collect();
-                assert_eq!(found[i] == NOISE, beside.is_empty(), "{i}");
-                assert!(found[i] == NOISE || beside.contains(&found[i]), "{i}");
-            }
-        }
-    }
-
-    #[test]
-    fn a_pole_of_many_cells_and_points_out_of_reach_take_no_longer_than_others() {
-        // A column of 200,000 cells: scanning the column for each of them would take 4e10 steps.
-        let mut points: Vec<Point> = (0..200_000).map(|i| [1.0, 2.0, i as f32 * 0.3]).collect();
-        // Also 200,000 points out of range, which all belong to the outermost cell if clamped.
-        points.extend((0..200_000).map(|i| [9e5, 9e5, i as f32 * 0.5]));
-        let found = clusters(&points, 0.5, 2);
-        assert!(found[..200_000].iter().all(|&label| label == 0));
-        assert!(found[200_000..].iter().all(|&label| label == NOISE));
-    }
-
-    #[test]
-    fn clusters_are_numbered_in_the_order_of_their_first_point() {
-        let mut points = vec![[9.0, 0.0, 0.0]];
-        points.extend(vec![[5.0, 0.0, 0.0]; 4]);
-        points.extend(vec![[-5.0, 0.0, 0.0]; 4]);
-        let expected = [NOISE, 0, 0, 0, 0, 1, 1, 1, 1];
-        assert_eq!(clusters(&points, 0.5, 4), expected);
-        assert_eq!(clusters(&[], 0.5, 4), [0; 0]);
-    }
-
-    #[test]
-    fn full_cells_that_do_not_touch_are_told_apart_in_time() {
-        // Comparing all pairs of core points of neighboring full cells would take billions of
-        // distances.
-        let mut random = Random::new(5);
-        let mut clump = |x: f64| -> Vec<Point> {
-            let mut side = || random.uniform(0.0, 0.25) as f32;
-            let clump = (0..40_000).map(|_| [side() + x as f32, side(), side()]);
-            clump.collect()
-        };
-        let points = [clump(0.0), clump(0.8)].concat();
-        let labels = clusters(&points, 0.5, 4);
-        assert!(labels[..40_000].iter().all(|&label| label == 0));
-        assert!(labels[40_000..].iter().all(|&label| label == 1));
-    }
-
-    #[test]
-    fn many_points_in_one_place_are_one_cluster() {
-        let points = vec![[1.0, 2.0, 3.0]; 130_000];
-        assert!(clusters(&points, 0.5, 4).iter().all(|&label| label == 0));
-    }
-}
+mod tests;

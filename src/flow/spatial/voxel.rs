@@ -39,9 +39,11 @@ pub(crate) fn voxel_mean(points: &[Point], side_m: f32) -> Vec<Point> {
 /// finite.
 pub(crate) fn voxel_first(points: &[Point], side_m: f32) -> Vec<u32> {
     let mut seen = KeyTable::<bool>::new(points.len() / EXPECTED);
+    let mut last = u64::MAX;
     let is_first = |row: &u32| {
-        let seen = seen.entry(key(points[*row as usize], side_m));
-        !core::mem::replace(seen, true)
+        let key = key(points[*row as usize], side_m);
+        // Points that follow each other often share a voxel.
+        core::mem::replace(&mut last, key) != key && !core::mem::replace(seen.entry(key), true)
     };
     (0..points.len() as u32).filter(is_first).collect()
 }
