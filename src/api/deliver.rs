@@ -24,11 +24,14 @@ pub enum DeliveryError {
 }
 
 impl DeliveryError {
-    /// Whether a later attempt may succeed.
+    /// Whether a later attempt may succeed. A place that was allowed when the job came may be unknown to
+    /// another node, or to this one until its settings are those of the others.
     pub fn is_worth_a_retry(&self) -> bool {
         match self {
             Self::Result(error) => error.row().retryable,
-            Self::Place(error) => matches!(error, NotDelivered::Failed(_)),
+            Self::Place(
+                NotDelivered::Failed(_) | NotDelivered::NotAllowed(_) | NotDelivered::Off,
+            ) => true,
         }
     }
 }

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use futures_util::stream::FuturesUnordered;
 use futures_util::{FutureExt, StreamExt};
 use tokio::sync::Notify;
+use url::{Position, Url};
 
 use crate::api::Service;
 use crate::clock::Timestamp;
@@ -25,6 +26,13 @@ const HOLD: Duration = Duration::from_secs(60);
 
 /// Number of notices that one receiver is told, and of results that one bucket gets, at a time.
 const OF_ONE_RECEIVER: usize = 8;
+/// Number of jobs whose files are removed at a time: a store that does not answer leaves room for the
+/// rest.
+const REMOVED_AT_ONCE: usize = AT_ONCE / 2;
+/// Time for the removal of a job's files, less than [`HOLD`].
+const REMOVED_WITHIN: Duration = Duration::from_secs(45);
+/// The receiver of removals. It is the name of no host.
+const FILES: &str = "/";
 /// A receiver that has this many to answer and has been silent for this long is left alone.
 const ANSWERS_WITHIN: Duration = Duration::from_secs(2);
 /// When a further notice of a receiver is taken again that answers, and of one that does not.
@@ -104,13 +112,21 @@ impl Outbox {
     /// Does one action.
     async fn act(&self, one: Outgoing, receiver: Option<String>) -> Tried {
         let settled = match &one.action {
-            Action::RemoveFiles => match self.blobs.remove_job(one.job).await {
-                Ok(()) => Settled::Done,
-                Err(error) => {
-                    tracing::warn!(%error, job = %one.job, "a forgotten job left something behind");
-                    Settled::Again(delay(one.attempts))
+            Action::RemoveFiles => {
+                let removed = self.blobs.remove_job(one.job);
+                let trouble = match tokio::time::timeout(REMOVED_WITHIN, removed).await {
+                    Ok(Ok(())) => None,
+                    Ok(Err(error)) => Some(error.to_string()),
+                    Err(_) => Some("the store does not answer".to_owned()),
+                };
+                match trouble {
+                    None => Settled::Done,
+                    Some(error) => {
+                        tracing::warn!(error, job = %one.job, "a forgotten job left something behind");
+                        Settled::Again(delay(one.attempts))
+                    }
                 }
-            },
+            }
             Action::Deliver(job) => {
                 let tried = self.service.deliver(job).await;
                 let tried = tried.map_err(|error| (error.is_worth_a_retry(), error));
@@ -162,6 +178,22 @@ fn outcome(settled: Settled) -> &'static str {
     }
 }
 
+/// The receiver of an action, a host and port or a bucket, and how many of its actions are done at a
+/// time.
+fn receiver_of(action: &Action) -> Option<(String, usize)> {
+    let url = match action {
+        Action::RemoveFiles => return Some((FILES.to_owned(), REMOVED_AT_ONCE)),
+        Action::Deliver(job) => &job.delivery.as_ref()?.uri,
+        Action::Notify { url, .. } => url,
+    };
+    // As it is connected to, and not as it is written: a URL may be written in many ways.
+    let host = match Url::parse(url) {
+        Ok(url) => url[Position::BeforeHost..Position::AfterPort].to_owned(),
+        Err(_) => String::new(),
+    };
+    Some((host, OF_ONE_RECEIVER))
+}
+
 /// What the receivers of notices and results are doing, by host and port or bucket.
 #[derive(Debug, Default)]
 struct Receivers(HashMap<String, Receiver>);
@@ -178,21 +210,15 @@ impl Receivers {
     /// Begins an action. Returns its receiver, or after which time it is to be taken again: a receiver is
     /// told a few notices at a time, and one that does not answer is left alone for a while.
     fn begin(&mut self, one: &Outgoing, now: Instant) -> Result<Option<String>, Duration> {
-        let url = match &one.action {
-            Action::RemoveFiles => None,
-            Action::Deliver(job) => job.delivery.as_ref().map(|delivery| &delivery.uri),
-            Action::Notify { url, .. } => Some(url),
-        };
-        let Some(url) = url else {
+        let Some((host, most)) = receiver_of(&one.action) else {
             return Ok(None);
         };
-        let host = url.split('/').nth(2).unwrap_or_default();
         let new = || Receiver {
             told: 0,
             moved: now,
         };
-        let receiver = self.0.entry(host.to_owned()).or_insert_with(new);
-        if receiver.told >= OF_ONE_RECEIVER {
+        let receiver = self.0.entry(host.clone()).or_insert_with(new);
+        if receiver.told >= most {
             return Err(match now - receiver.moved > ANSWERS_WITHIN {
                 true => SILENT_DELAY,
                 false => BUSY_DELAY,
@@ -202,7 +228,7 @@ impl Receivers {
             receiver.moved = now;
         }
         receiver.told += 1;
-        Ok(Some(host.to_owned()))
+        Ok(Some(host))
     }
 
     /// Ends an action.
@@ -262,6 +288,41 @@ mod tests {
             assert_eq!(receivers.end(tried), (1, Settled::Done));
         }
         assert!(receivers.begin(&notice("silent:8443"), later).is_ok());
+    }
+
+    #[test]
+    fn a_receiver_is_the_same_however_its_address_is_written() {
+        let of = |url: &str| {
+            let action = Action::Notify {
+                url: url.to_owned(),
+                body: String::new(),
+            };
+            receiver_of(&action).map(|(host, _)| host)
+        };
+        for url in [
+            "https://hooks.example.com/fnsf/a",
+            "https:hooks.example.com/fnsf/b",
+            "HTTPS://Hooks.Example.com:443/c",
+            "https:///hooks.example.com/d",
+        ] {
+            assert_eq!(of(url).as_deref(), Some("hooks.example.com"), "{url}");
+        }
+        assert_eq!(of("s3://labels/run/0.npz").as_deref(), Some("labels"));
+    }
+
+    #[test]
+    fn removals_leave_half_of_the_room_to_the_rest() {
+        let removal = Outgoing {
+            number: 1,
+            job: crate::job::JobId::fresh(),
+            attempts: 1,
+            action: Action::RemoveFiles,
+        };
+        let mut receivers = Receivers::default();
+        let now = Instant::now();
+        let begun = (0..AT_ONCE).filter(|_| receivers.begin(&removal, now).is_ok());
+        assert_eq!(begun.count(), AT_ONCE / 2);
+        assert!(REMOVED_WITHIN < HOLD);
     }
 
     #[test]

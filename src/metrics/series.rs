@@ -116,7 +116,8 @@ fn seconds() -> Seconds {
 }
 
 impl Metrics {
-    /// Creates every series with the value 0. `devices` are the names of all devices, the values of
+    /// Creates every series with the value 0; the free space is infinite until it is measured, as it is
+    /// with a bucket. `devices` are the names of all devices, the values of
     /// the label `device`.
     pub fn new(devices: &[impl AsRef<str>]) -> Self {
         let metrics = Self {
@@ -167,6 +168,8 @@ impl Metrics {
 
     /// Makes every series, so that their number never changes.
     fn fill(&self, devices: &[impl AsRef<str>]) {
+        self.data_free_bytes.set(f64::INFINITY);
+        self.data_free_inodes.set(f64::INFINITY);
         for state in State::ALL.into_iter().filter(|state| state.is_end()) {
             drop(self.finished.get_or_create(&Outcome {
                 outcome: state.name(),

@@ -74,9 +74,14 @@ pub enum NotTold {
 
 impl NotTold {
     /// Whether a later attempt may succeed. Status 410 (Gone) means that the receiver was removed, so it
-    /// is not retried.
+    /// is not retried. A URL that was allowed when the job came may be unknown to another node, or to
+    /// this one until its settings are those of the others.
     pub fn is_worth_a_retry(&self) -> bool {
-        matches!(self, Self::Failed(_)) || matches!(self, Self::Status(status) if *status != 410)
+        match self {
+            Self::Failed(_) | Self::NotAllowed(_) => true,
+            Self::Status(status) => *status != 410,
+            Self::Private => false,
+        }
     }
 }
 

@@ -1,5 +1,6 @@
 //! The part of the store that only a bucket of an object store has.
 
+use std::ffi::OsString;
 use std::io;
 use std::sync::Arc;
 
@@ -37,9 +38,22 @@ pub(super) fn open(url: &str) -> Result<Arc<dyn ObjectStore>, BucketError> {
     let parsed = parsed.ok_or_else(|| BucketError::Url(url.to_owned()))?;
     // The client of the bucket needs one.
     let _named_already = rustls::crypto::ring::default_provider().install_default();
-    let opened = parse_url_opts(&parsed, std::env::vars());
+    let opened = parse_url_opts(&parsed, settings(std::env::vars_os()));
     let (store, prefix) = opened.map_err(BucketError::Settings)?;
     Ok(Arc::new(PrefixStore::new(store, prefix)))
+}
+
+/// The variables of the environment that are meant for buckets: those of the vendors, the last two of
+/// Azure's managed identities. The client would take others, too: a program's own `ENDPOINT` or `TOKEN`.
+fn settings(
+    variables: impl Iterator<Item = (OsString, OsString)>,
+) -> impl Iterator<Item = (String, String)> {
+    const PREFIXES: [&str; 5] = ["AWS_", "GOOGLE_", "AZURE_", "IDENTITY_", "MSI_"];
+    variables.filter_map(|(name, value)| {
+        let name = name.into_string().ok()?;
+        let is_meant = PREFIXES.iter().any(|prefix| name.starts_with(prefix));
+        Some((name, value.into_string().ok()?)).filter(|_| is_meant)
+    })
 }
 
 /// Writes, reads back and removes 64 KiB.
@@ -49,9 +63,10 @@ pub(super) async fn probe(store: &dyn ObjectStore) -> Result<(), BlobError> {
     let path = Path::from(format!("probe/{}", JobId::fresh()));
     let bytes = Bytes::from(vec![7; BYTES]);
     store.put(&path, bytes.clone().into()).await?;
-    let read = store.get(&path).await?.bytes().await?;
+    let read = async { store.get(&path).await?.bytes().await }.await;
+    // Whether or not it could be read.
     store.delete(&path).await?;
-    if read != bytes {
+    if read? != bytes {
         return Err(io::Error::from(io::ErrorKind::InvalidData).into());
     }
     Ok(())
@@ -97,4 +112,32 @@ pub(super) async fn remove_job(store: &dyn ObjectStore, id: JobId) -> Result<(),
 pub(super) async fn is_empty(store: &dyn ObjectStore) -> Result<bool, BlobError> {
     let first = store.list(Some(&Path::from("jobs"))).try_next().await?;
     Ok(first.is_none())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_variables_of_the_vendors_set_a_bucket() {
+        let variables = [
+            ("AWS_REGION", "eu-central-1"),
+            ("TOKEN", "of another program"),
+            ("ENDPOINT", "https://elsewhere.example"),
+            ("ALLOW_INVALID_CERTIFICATES", "true"),
+            ("GOOGLE_SERVICE_ACCOUNT", "/key.json"),
+            ("AZURE_STORAGE_ACCOUNT_NAME", "labels"),
+        ];
+        let variables =
+            variables.map(|(name, value)| (OsString::from(name), OsString::from(value)));
+        let taken: Vec<String> = settings(variables.into_iter())
+            .map(|(name, _)| name)
+            .collect();
+        let expected = [
+            "AWS_REGION",
+            "GOOGLE_SERVICE_ACCOUNT",
+            "AZURE_STORAGE_ACCOUNT_NAME",
+        ];
+        assert_eq!(taken, expected);
+    }
 }

@@ -1,8 +1,7 @@
 {{/* The variables that all nodes have. */}}
 {{- define "fnsf.settings" -}}
-FNSF_SERVE_STORAGE: {{ .Values.storage | quote }}
-FNSF_SERVE_SHUTDOWN__READINESS_DELAY_SECONDS: "5"
-{{- range $name, $value := merge (dict) .Values.settings .Values.storageSettings }}
+{{- $own := dict "FNSF_SERVE_STORAGE" .Values.storage "FNSF_SERVE_SHUTDOWN__READINESS_DELAY_SECONDS" "5" }}
+{{- range $name, $value := merge (dict) .Values.settings .Values.storageSettings $own }}
 {{ $name }}: {{ $value | quote }}
 {{- end }}
 {{- end }}

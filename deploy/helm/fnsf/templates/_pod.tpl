@@ -30,7 +30,7 @@ securityContext:
   fsGroup: 65532
   seccompProfile:
     type: RuntimeDefault
-terminationGracePeriodSeconds: 45
+terminationGracePeriodSeconds: {{ .Values.gracePeriodSeconds }}
 {{- end }}
 
 {{- define "fnsf.probes" -}}
