@@ -194,6 +194,6 @@ mod tests {
         assert!(NotTold::Status(404).is_worth_a_retry());
         assert!(!NotTold::Status(410).is_worth_a_retry());
         assert!(!NotTold::Private.is_worth_a_retry());
-        assert!(!NotTold::NotAllowed(NotAllowed::Elsewhere).is_worth_a_retry());
+        assert!(NotTold::NotAllowed(NotAllowed::Elsewhere).is_worth_a_retry());
     }
 }
