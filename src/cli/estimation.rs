@@ -63,8 +63,8 @@ pub(super) struct Estimation {
     /// vehicle itself. None by default
     #[arg(long, value_name = "R", value_parser = positive)]
     min_range_m: Option<f32>,
-    /// Estimate pairs that are otherwise refused: sweeps that do not show one scene, coordinates that
-    /// are not metres, and sweeps more than 50 km from their origin. Without overlap the confidence is 0
+    /// Estimate pairs that are otherwise refused: sweeps that do not show one scene, and coordinates
+    /// that are not metres. Without overlap the confidence is 0
     #[arg(long)]
     force: bool,
     /// Seconds from one sweep to the next, above 0 and at most 60; the velocities of objects are

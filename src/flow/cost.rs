@@ -106,7 +106,7 @@ pub fn neighbor_cost(points: usize) -> NeighborCost {
 /// distance transform. Computes no distances.
 ///
 /// # Errors
-/// [`FlowError::NotMetres`], [`FlowError::NotSensorFrame`], [`FlowError::TooFewPoints`], [`FlowError::NoGroundMask`] or
+/// [`FlowError::NotMetres`], [`FlowError::TooFewPoints`], [`FlowError::NoGroundMask`] or
 /// [`FlowError::GroundMaskLength`] for the pair, and [`FlowError::Backend`] if the distance transform is rejected: as
 /// [`super::estimate()`]. The ground masks of neighbor sweeps and the limits of a device are not
 /// checked.

@@ -65,18 +65,6 @@ pub enum FlowError {
         /// Median distance of the points from their middle, metres.
         spread_m: f32,
     },
-    /// The points of a sweep lie too far from its origin, see [`super::MAX_AWAY_M`].
-    #[error(
-        "half of the {cloud} cloud's points lie more than {:.0} km from the origin: sweeps are in their \
-         sensor's frame, are these in a map's? The option force estimates them all the same",
-        away_m / 1000.0
-    )]
-    NotSensorFrame {
-        /// `source` or `target`.
-        cloud: &'static str,
-        /// Distance of the points' middle from the origin, metres.
-        away_m: f32,
-    },
     /// The control cancelled the estimate.
     #[error("the estimate was cancelled")]
     Cancelled,
@@ -109,15 +97,15 @@ impl From<FitError> for FlowError {
 impl FlowError {
     /// Whether the input or its options caused the error, rather than the machine.
     ///
-    /// True for sweeps of two scenes, coordinates that are not metres or not those of a sensor's frame,
-    /// too few points, a missing ground mask or one of the wrong length, times of the wrong length, an empty target,
+    /// True for sweeps of two scenes, coordinates that are not metres, too few points, a missing
+    /// ground mask or one of the wrong length, times of the wrong length, an empty target,
     /// clouds that span too much space, a pair that exceeds the allowed memory or the memory of the
     /// device, and an option that the device does not support. False for all other errors,
     /// including an invalid cell or band of the distance transform.
     pub fn is_input(&self) -> bool {
         match self {
             Self::NoOverlap { .. } | Self::TooFewPoints { .. } => true,
-            Self::NotMetres { .. } | Self::NotSensorFrame { .. } => true,
+            Self::NotMetres { .. } => true,
             Self::NoGroundMask | Self::GroundMaskLength { .. } | Self::TimesLength { .. } => true,
             Self::Backend(BackendError::Distance(error)) => !matches!(
                 error,

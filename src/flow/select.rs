@@ -7,7 +7,7 @@ use std::borrow::Cow;
 use super::data::{MIN_POINTS, Point, Random, square_distance, stride_sample};
 use super::error::FlowError;
 use super::ground;
-use super::options::{Ego, Ground, MAX_AWAY_M, MAX_SPREAD_M, Method, Options};
+use super::options::{Ego, Ground, MAX_SPREAD_M, Method, Options};
 use super::problem::{NeighborSweep, Problem};
 
 /// The selected points of a pair.
@@ -49,8 +49,8 @@ pub(crate) fn find_ground(sweeps: &[&[Point]]) -> Vec<Vec<bool>> {
 /// of its positions are.
 ///
 /// # Errors
-/// [`FlowError`] where coordinates are not metres or not those of a sensor's frame, a mask is missing or
-/// has another length, or fewer than [`MIN_POINTS`] points of a cloud remain.
+/// [`FlowError`] where coordinates are not metres, a mask is missing or has another length, or fewer
+/// than [`MIN_POINTS`] points of a cloud remain.
 pub(crate) fn select(
     problem: &Problem,
     given: [&[Point]; 2],
@@ -130,10 +130,10 @@ fn points_at(rows: &[usize], points: &[Point]) -> Vec<Point> {
     rows.iter().map(|&row| points[row]).collect()
 }
 
-/// Refuses points that lie too far apart for metres, or too far from the origin for a sensor's frame.
+/// Refuses points that lie too far apart for metres.
 ///
 /// # Errors
-/// [`FlowError::NotMetres`], [`FlowError::NotSensorFrame`].
+/// [`FlowError::NotMetres`].
 fn check_metres(cloud: &'static str, points: &[Point], options: &Options) -> Result<(), FlowError> {
     /// Points that are looked at.
     const SAMPLED: usize = 1024;
@@ -152,10 +152,6 @@ fn check_metres(cloud: &'static str, points: &[Point], options: &Options) -> Res
         )
     };
     let middle: Point = core::array::from_fn(axis);
-    let away_m = square_distance(middle, [0.0; 3]).sqrt();
-    if away_m > MAX_AWAY_M {
-        return Err(FlowError::NotSensorFrame { cloud, away_m });
-    }
     let from_middle = sampled.iter().filter(finite);
     let from_middle = from_middle.map(|&point| square_distance(point, middle).sqrt());
     let spread_m = median(from_middle.collect());

@@ -74,8 +74,7 @@ pub struct JobOptions {
     #[serde(skip_serializing_if = "is_default")]
     pub field: FieldChoices,
     /// Also estimates pairs that are otherwise refused as nonsense: sweeps that do not show one scene,
-    /// coordinates that are not metres, sweeps more than 50 km from the origin of their frame, and
-    /// sweeps out of the order of the numbers in their names.
+    /// coordinates that are not metres, and sweeps out of the order of the numbers in their names.
     /// Without overlap the confidence is 0.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub force: bool,

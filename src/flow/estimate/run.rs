@@ -28,9 +28,8 @@ use crate::flow::select::select;
 /// # Errors
 /// - [`FlowError::TooFewPoints`], [`FlowError::NoGroundMask`] or [`FlowError::GroundMaskLength`] if
 ///   the problem does not suit the options.
-/// - [`FlowError::NotMetres`], [`FlowError::NotSensorFrame`] or [`FlowError::NoOverlap`] if the
-///   coordinates are not metres or those of a map's frame, or the sweeps do not show one scene after
-///   the ego motion. Not with [`Options::force`].
+/// - [`FlowError::NotMetres`] or [`FlowError::NoOverlap`] if the coordinates are not metres, or the
+///   sweeps do not show one scene after the ego motion. Not with [`Options::force`].
 /// - [`FlowError::TimesLength`] if a sweep does not have one time per point.
 /// - [`FlowError::Cancelled`] if the control cancels.
 /// - [`FlowError::Diverged`] if the loss of a field is not finite.

@@ -178,30 +178,6 @@ fn identical_sweeps_are_noticed_though_some_of_their_points_are_no_numbers() {
 }
 
 #[test]
-fn sweeps_of_a_map_s_frame_are_refused_by_name() {
-    let pair = street();
-    let shifted = |points: &[Point]| -> Vec<Point> {
-        points
-            .iter()
-            .map(|&[x, y, z]| [x + 200_000.0, y, z])
-            .collect()
-    };
-    let (source, target) = (shifted(&pair.source), shifted(&pair.target));
-    let backend = CpuBackend::new(Some(2)).expect("threads");
-    let problem = Problem::pair(&source, &target);
-    let options = Preset::Default.options(None);
-    let refused = estimate(&backend, &problem, &options, &Uncontrolled).expect_err("far away");
-    assert!(matches!(
-        refused,
-        FlowError::NotSensorFrame {
-            cloud: "source",
-            ..
-        }
-    ));
-    assert!(refused.to_string().contains("200 km"), "{refused}");
-}
-
-#[test]
 fn ground_that_is_kept_is_no_overlap_of_two_scenes() {
     let other = StreetOptions {
         beams: 16,

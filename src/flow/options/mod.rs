@@ -20,8 +20,7 @@ pub use model::{
 };
 pub use objects::ObjectOptions;
 pub use pair::{
-    CERTAIN_OVERLAP, DEFAULT_DT_S, Ego, Ground, LEAST_OVERLAP, MAX_AWAY_M, MAX_SPREAD_M, Method,
-    Options,
+    CERTAIN_OVERLAP, DEFAULT_DT_S, Ego, Ground, LEAST_OVERLAP, MAX_SPREAD_M, Method, Options,
 };
 pub use partition::PartitionOptions;
 pub use preset::Preset;

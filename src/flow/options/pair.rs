@@ -15,10 +15,6 @@ pub const CERTAIN_OVERLAP: f32 = 0.6;
 /// Largest median distance of a sweep's points from their middle, metres. Lidars reach 300 m.
 pub const MAX_SPREAD_M: f32 = 1000.0;
 
-/// Distance of the middle of a sweep from its origin, metres, above which its frame is no sensor's.
-/// Single precision has steps of 4 mm there.
-pub const MAX_AWAY_M: f32 = 50_000.0;
-
 /// Options of one estimate. Start from a [`super::Preset`] and change single values.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Options {
@@ -44,7 +40,7 @@ pub struct Options {
     /// Handling of the ego motion.
     pub ego: Ego,
     /// Whether pairs are estimated that are otherwise refused as nonsense: sweeps that do not show
-    /// one scene, coordinates that are not metres, and sweeps far from the origin of their frame.
+    /// one scene, and coordinates that are not metres.
     pub force: bool,
     /// Whether sweeps with times are deskewed even where they do not fit better then.
     pub always_deskew: bool,
