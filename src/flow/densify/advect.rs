@@ -14,7 +14,7 @@ const SETTLED_M: f32 = 0.01;
 /// Maximum number of corrections of an inverse.
 const CORRECTIONS: usize = 20;
 
-/// Coordinates of this size or larger are invalid, metres.
+/// Larger coordinates are invalid, metres.
 const FARTHEST_M: f32 = 1e6;
 /// Points between two checks of the control: about a tenth of a second on two cores.
 const PIECE: usize = 1 << 17;
@@ -203,7 +203,7 @@ impl Context<'_> {
     }
 }
 
-/// Whether all coordinates are finite and below [`FARTHEST_M`].
+/// Whether all coordinates are finite and at most [`FARTHEST_M`].
 fn is_place(point: Point) -> bool {
-    point.iter().all(|value| value.abs() < FARTHEST_M)
+    point.iter().all(|value| value.abs() <= FARTHEST_M)
 }

@@ -100,6 +100,8 @@ pub struct TrackingMetrics {
 #[derive(Clone, Debug, Default)]
 pub struct TrackingPool {
     sweeps: Vec<TrackedSweep>,
+    /// Number of matches that the best assignment of whole identities explains, summed over sequences.
+    explained: f64,
     /// Offsets that keep the identities of sequences apart: those of the current sequence.
     next: [u32; 2],
 }
@@ -108,6 +110,7 @@ impl TrackingPool {
     /// Adds a sequence. Identities of other sequences are other objects.
     pub fn add(&mut self, sequence: &[TrackedSweep]) {
         let [truth, found] = self.next;
+        let first = self.sweeps.len();
         for sweep in sequence {
             let shifted = |objects: &[TrackedObject], by: u32| -> Vec<TrackedObject> {
                 let shift = |object: &TrackedObject| TrackedObject {
@@ -129,6 +132,7 @@ impl TrackingPool {
             self.next = [after(&sweep.truth, a), after(&sweep.found, b)];
             self.sweeps.push(without_ignored(sweep));
         }
+        self.explained += explained(&self.sweeps[first..]);
     }
 
     /// The metrics of all sequences together.
@@ -139,7 +143,7 @@ impl TrackingPool {
             ..TrackingMetrics::default()
         };
         self.clear_mot(&mut metrics);
-        metrics.idf1 = self.idf1();
+        metrics.idf1 = 2.0 * self.explained / (metrics.truth + metrics.found).max(1) as f64;
         metrics.hota = self.hota();
         metrics
     }
@@ -174,37 +178,6 @@ impl TrackingPool {
         if metrics.truth > 0 {
             metrics.mota = 1.0 - errors as f64 / metrics.truth as f64;
         }
-    }
-
-    /// The F1 measure of the best assignment of identities.
-    fn idf1(&self) -> f64 {
-        let mut together: BTreeMap<(u32, u32), usize> = BTreeMap::new();
-        for sweep in &self.sweeps {
-            for truth in &sweep.truth {
-                for found in sweep.found.iter().filter(|f| similarity(truth, f) > 0.0) {
-                    *together.entry((truth.id, found.id)).or_default() += 1;
-                }
-            }
-        }
-        let ids = |of: fn(&TrackedSweep) -> &Vec<TrackedObject>| -> Vec<u32> {
-            let all = self.sweeps.iter().flat_map(of);
-            all.map(|object| object.id)
-                .collect::<BTreeSet<_>>()
-                .into_iter()
-                .collect()
-        };
-        let (truths, found) = (ids(|s| &s.truth), ids(|s| &s.found));
-        let common = |t: &u32, f: &u32| together.get(&(*t, *f)).map_or(0.0, |&n| n as f64);
-        let right: f64 = assign(&truths, &found, common)
-            .into_iter()
-            .map(|(t, f)| common(&truths[t], &found[f]))
-            .sum();
-        let objects: usize = self
-            .sweeps
-            .iter()
-            .map(|s| s.truth.len() + s.found.len())
-            .sum();
-        2.0 * right / objects.max(1) as f64
     }
 
     /// HOTA, averaged over the levels of similarity.
@@ -253,6 +226,26 @@ impl TrackingPool {
         };
         matches.iter().map(at).sum::<f64>() / LEVELS as f64
     }
+}
+
+/// Number of matches in the sweeps of one sequence that the best assignment of whole identities explains.
+fn explained(sweeps: &[TrackedSweep]) -> f64 {
+    let mut together: BTreeMap<(u32, u32), usize> = BTreeMap::new();
+    for sweep in sweeps {
+        for truth in &sweep.truth {
+            for found in sweep.found.iter().filter(|f| similarity(truth, f) > 0.0) {
+                *together.entry((truth.id, found.id)).or_default() += 1;
+            }
+        }
+    }
+    let ids = |of: fn(&TrackedSweep) -> &Vec<TrackedObject>| -> Vec<u32> {
+        let all: BTreeSet<u32> = sweeps.iter().flat_map(of).map(|object| object.id).collect();
+        all.into_iter().collect()
+    };
+    let (truths, found) = (ids(|s| &s.truth), ids(|s| &s.found));
+    let common = |t: &u32, f: &u32| together.get(&(*t, *f)).map_or(0.0, |&n| n as f64);
+    let assigned = assign(&truths, &found, common).into_iter();
+    assigned.map(|(t, f)| common(&truths[t], &found[f])).sum()
 }
 
 /// The sweep without its ignored objects, and without the found objects that are assigned to them.

@@ -24,7 +24,8 @@ pub(super) struct Companions(Vec<(u32, u32, u32)>);
 
 impl Companions {
     /// Counts the pairs of `live` objects that move as one vehicle. Where a pair has done so for
-    /// [`TOGETHER`] sweeps, its younger object becomes a part of the older.
+    /// [`TOGETHER`] sweeps, its younger object becomes a part of the older. Where the younger alone is
+    /// a track, the older becomes a part of it.
     pub(super) fn join(&mut self, live: &mut Vec<LiveObject>) {
         let mut now = Vec::new();
         let mut joined = vec![false; live.len()];
@@ -41,9 +42,13 @@ impl Companions {
                 if sweeps < TOGETHER {
                     now.push((a.id, b.id, sweeps));
                 } else {
-                    let points = live[younger].next.points.clone();
-                    live[older].next.points.extend(points);
-                    joined[younger] = true;
+                    let [whole, part] = match b.confirmed && !a.confirmed {
+                        true => [younger, older],
+                        false => [older, younger],
+                    };
+                    let points = core::mem::take(&mut live[part].next.points);
+                    live[whole].next.points.extend(points);
+                    joined[part] = true;
                 }
             }
         }
@@ -76,4 +81,81 @@ fn is_one(a: &Carried, b: &Carried) -> bool {
     let both = [a.points.as_slice(), &b.points].concat();
     let whole = OrientedBox::enclosing(&both, Some([x, y]));
     whole.size[0] <= VEHICLE_M[0] && whole.size[1] <= VEHICLE_M[1]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::flow::data::RigidTransform;
+    use crate::flow::objects::{Cluster, Objects};
+    use crate::flow::tracks::association::Candidate;
+    use crate::flow::tracks::live_object::Moment;
+
+    /// Two parts of a vehicle, which are 0.5 m apart and move at 10 m/s.
+    fn two_parts() -> Vec<LiveObject> {
+        let part = |x: f32| {
+            let points = [0.0, 0.5, 1.0, 1.5].map(|along| [x + along, 5.0, 0.5]);
+            let velocity = [10.0, 0.0, 0.0];
+            let bounds = OrientedBox {
+                center: [x + 0.75, 5.0, 0.5],
+                size: [1.5, 0.0, 0.0],
+                yaw: 0.0,
+            };
+            let cluster = Cluster {
+                points: 4,
+                dynamic: true,
+                bounds,
+                velocity,
+                moving: 1.0,
+                confidence: 1.0,
+                ..Cluster::default()
+            };
+            let candidate = Candidate {
+                points: points.to_vec(),
+                center: bounds.center,
+                velocity,
+                moves: true,
+            };
+            (cluster, candidate)
+        };
+        let (clusters, candidates): (Vec<Cluster>, Vec<Candidate>) =
+            [part(10.0), part(12.0)].into_iter().unzip();
+        let objects = Objects {
+            clusters,
+            ..Objects::default()
+        };
+        let moment = Moment {
+            objects: &objects,
+            ego: &RigidTransform::identity(),
+            dt_s: 0.1,
+            sweep: 0,
+        };
+        let object = |index: usize| LiveObject::new(index as u32, &moment, &candidates, index);
+        vec![object(0), object(1)]
+    }
+
+    #[test]
+    fn the_older_part_of_a_vehicle_stays_unless_the_younger_alone_is_a_track() {
+        for (confirmed, stays) in [
+            ([false, false], 0),
+            ([true, false], 0),
+            ([true, true], 0),
+            ([false, true], 1),
+        ] {
+            let mut live = two_parts();
+            for (object, confirmed) in live.iter_mut().zip(confirmed) {
+                object.confirmed = confirmed;
+            }
+            let mut companions = Companions::default();
+            for sweep in 1..=TOGETHER {
+                assert_eq!(live.len(), 2, "before sweep {sweep}");
+                companions.join(&mut live);
+            }
+            let [object] = live.as_slice() else {
+                panic!("{} objects", live.len());
+            };
+            assert_eq!(object.id, stays, "{confirmed:?}");
+            assert_eq!(object.next.points.len(), 8);
+        }
+    }
 }
