@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::{Context, anyhow};
 use clap::Args;
 use reqwest::multipart::Form;
-use reqwest::{Method, RequestBuilder, Response};
+use reqwest::{Method, RequestBuilder, Response, StatusCode};
 use serde_json::Value;
 use url::Url;
 
@@ -55,6 +55,22 @@ pub(super) fn block_on<T>(command: impl Future<Output = Result<T, Failure>>) -> 
     runtime.map_err(Failure::internal)?.block_on(command)
 }
 
+/// An answer of the server other than 2xx.
+#[derive(Debug, thiserror::Error)]
+#[error("the server answered {status}: {detail}")]
+struct Refused {
+    status: StatusCode,
+    detail: String,
+}
+
+/// Whether a request may succeed when it is repeated: the server was not reached, or it starts or stops.
+pub(super) fn may_pass(error: &anyhow::Error) -> bool {
+    match error.downcast_ref::<Refused>() {
+        Some(refused) => refused.status == StatusCode::SERVICE_UNAVAILABLE,
+        None => error.is::<reqwest::Error>(),
+    }
+}
+
 /// A client of one server.
 pub(super) struct Client {
     server: Url,
@@ -95,7 +111,8 @@ impl Client {
         let status = response.status();
         let problem: Value = response.json().await.unwrap_or_default();
         let detail = problem["detail"].as_str().unwrap_or("without a word");
-        Err(anyhow!("the server answered {status}: {detail}"))
+        let detail = detail.to_owned();
+        Err(Refused { status, detail }.into())
     }
 
     /// Sends a request without a body, and reads the JSON of its answer; null of an empty one.

@@ -202,6 +202,10 @@ impl Export {
                 continue;
             };
             clouds += 1;
+            if files::identity(sweep).is_some_and(|own| Some(own) == self.identity(&path)) {
+                // It is in its place.
+                continue;
+            }
             if sweep.extension().is_some_and(|ending| ending == "pcd") {
                 // It keeps its other columns.
                 let bytes = files::read_bytes(sweep)?;
@@ -255,12 +259,26 @@ impl Export {
         )
     }
 
-    /// Writes a file of the layout.
+    /// What the file of the layout at `path` is, if it is there.
+    fn identity(&self, path: &str) -> Option<(u64, u64)> {
+        files::identity(&self.output.join(path))
+    }
+
+    /// Writes a file of the layout. Refuses to write over an input.
     fn write<E: std::error::Error + Send + Sync + 'static>(
         &self,
         path: &str,
         writer: impl FnOnce(&mut io::BufWriter<fs::File>) -> Result<(), E>,
     ) -> Result<(), Failure> {
+        let place = self.identity(path);
+        let mut inputs = self.sweeps.iter().chain([&self.tracks]);
+        if place.is_some() && inputs.any(|input| files::identity(input) == place) {
+            let place = self.output.join(path);
+            return Err(Failure::usage(anyhow!(
+                "{} would be written over: give another folder",
+                place.display()
+            )));
+        }
         files::write_below(&self.output, Path::new(path), writer)
     }
 }

@@ -235,16 +235,18 @@ fn read_calibration<T>(
     read(path, |bytes, _| reader(bytes, second.as_deref()))
 }
 
+/// What a regular file is, under all of its names: device and inode.
+pub(super) fn identity(path: &Path) -> Option<(u64, u64)> {
+    let about = fs::metadata(path).ok().filter(fs::Metadata::is_file)?;
+    Some((about.dev(), about.ino()))
+}
+
 /// Refuses outputs that cannot be written, and outputs that are the same file as an input or
 /// another output. Called before any work.
 pub(super) fn check_outputs<'a>(
     outputs: impl IntoIterator<Item = &'a PathBuf>,
     inputs: impl IntoIterator<Item = &'a PathBuf>,
 ) -> Result<(), Failure> {
-    let identity = |path: &Path| {
-        let about = fs::metadata(path).ok().filter(fs::Metadata::is_file)?;
-        Some((about.dev(), about.ino()))
-    };
     let mut taken: HashMap<(u64, u64), &Path> = HashMap::new();
     taken.extend(
         inputs
@@ -319,13 +321,9 @@ pub(super) fn write<E: std::error::Error + Send + Sync + 'static>(
     writer: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
 ) -> Result<(), Failure> {
     let written = || -> anyhow::Result<()> {
-        let index = place_of(path).context("its folder is not there")?;
-        if index.exists() && !index.is_file() {
-            let mut file = BufWriter::new(File::create(&index)?);
-            writer(&mut file)?;
-            return Ok(file.flush()?);
-        }
-        replace(&index, writer)
+        let mut output = Output::create(path)?;
+        writer(&mut output.file)?;
+        output.complete()
     };
     written()
         .with_context(|| format!("cannot write {}", path.display()))
@@ -351,21 +349,50 @@ pub(super) fn write_below<E: std::error::Error + Send + Sync + 'static>(
         if !inner.starts_with(fs::canonicalize(folder)?) {
             return Err(anyhow!("a link leads out of {}", folder.display()));
         }
-        replace(&inner.join(path.file_name().unwrap_or_default()), writer)
+        let place = inner.join(path.file_name().unwrap_or_default());
+        let mut output = Output::replacing(place)?;
+        writer(&mut output.file)?;
+        output.complete()
     };
     written()
         .with_context(|| format!("cannot write {}", path.display()))
         .map_err(Failure::internal)
 }
 
-/// Writes a file under a temporary name, and renames it to `path`.
-fn replace<E: std::error::Error + Send + Sync + 'static>(
-    path: &Path,
-    writer: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
-) -> anyhow::Result<()> {
-    let (unfinished, file) = Unfinished::beside(path)?;
-    let mut file = BufWriter::new(file);
-    writer(&mut file)?;
-    file.flush()?;
-    Ok(unfinished.rename(path)?)
+/// A file that is being written, under a temporary name unless it is a pipe or a device.
+pub(super) struct Output {
+    pub(super) file: BufWriter<File>,
+    /// The temporary file, and the path that it gets in the end.
+    unfinished: Option<(Unfinished, PathBuf)>,
+}
+
+impl Output {
+    /// Begins to write a file, as [`write`] does.
+    pub(super) fn create(path: &Path) -> anyhow::Result<Self> {
+        let place = place_of(path).context("its folder is not there")?;
+        if place.is_file() || !place.exists() {
+            return Self::replacing(place);
+        }
+        Ok(Self {
+            file: BufWriter::new(File::create(&place)?),
+            unfinished: None,
+        })
+    }
+
+    fn replacing(place: PathBuf) -> anyhow::Result<Self> {
+        let (unfinished, file) = Unfinished::beside(&place)?;
+        Ok(Self {
+            file: BufWriter::new(file),
+            unfinished: Some((unfinished, place)),
+        })
+    }
+
+    /// Gives the complete file its name.
+    pub(super) fn complete(mut self) -> anyhow::Result<()> {
+        self.file.flush()?;
+        match self.unfinished {
+            Some((unfinished, place)) => Ok(unfinished.rename(&place)?),
+            None => Ok(()),
+        }
+    }
 }

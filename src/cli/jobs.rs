@@ -95,14 +95,41 @@ impl Jobs {
                 let job = job.map_err(Failure::internal)?;
                 say(format_args!("{job:#}"))
             }
-            Command::Cancel(of) => each(client, of, Method::DELETE, "", "cancelled").await,
-            Command::Requeue(of) => each(client, of, Method::POST, "/requeue", "requeued").await,
-            Command::Remove(of) => {
-                each(client, of, Method::DELETE, "?remove=true", "removed").await
-            }
+            Command::Cancel(of) => each(client, of, &CANCEL).await,
+            Command::Requeue(of) => each(client, of, &REQUEUE).await,
+            Command::Remove(of) => each(client, of, &REMOVE).await,
         }
     }
 }
+
+/// A change of jobs: its request, and the word for a job that was changed.
+struct Change {
+    method: Method,
+    /// What follows the path of the job.
+    rest: &'static str,
+    done: &'static str,
+    /// Whether the request leaves a job as it is, by its JSON.
+    leaves: fn(&Value) -> bool,
+}
+
+const CANCEL: Change = Change {
+    method: Method::DELETE,
+    rest: "",
+    done: "cancelled",
+    leaves: |job| job["finished_at"].is_string() && job["state"] != "cancelled",
+};
+const REQUEUE: Change = Change {
+    method: Method::POST,
+    rest: "/requeue",
+    done: "requeued",
+    leaves: |_| false,
+};
+const REMOVE: Change = Change {
+    method: Method::DELETE,
+    rest: "?remove=true",
+    done: "removed",
+    leaves: |_| false,
+};
 
 /// The path of a job, with what follows it.
 fn path(id: &str, rest: &str) -> String {
@@ -185,25 +212,26 @@ async fn list(client: &Client, filter: &Filter, limit: usize, json: bool) -> Res
     Ok(())
 }
 
-/// Makes the same request for each job of a selection. Goes on after a refusal, and fails in the end.
-async fn each(
-    client: &Client,
-    of: &Selection,
-    method: Method,
-    rest: &str,
-    done: &str,
-) -> Result<(), Failure> {
+/// Makes the same change to each job of a selection. Goes on after a refusal, and fails in the end.
+async fn each(client: &Client, of: &Selection, change: &Change) -> Result<(), Failure> {
+    let done = change.done;
     let mut ids = of.ids.clone();
     if ids.is_empty() {
         let found = find(client, &of.filter, usize::MAX).await?;
-        ids = found
-            .iter()
+        let changed = found.iter().filter(|job| !(change.leaves)(job));
+        ids = changed
             .filter_map(|job| Some(job["id"].as_str()?.to_owned()))
             .collect();
     }
-    let mut refused = 0;
+    let (mut refused, mut left) = (0, 0);
     for id in &ids {
-        match client.call(method.clone(), &path(id, rest)).await {
+        let path = path(id, change.rest);
+        match client.call(change.method.clone(), &path).await {
+            Ok(job) if (change.leaves)(&job) => {
+                left += 1;
+                let state = job["state"].as_str().unwrap_or_default();
+                say(format_args!("{id} not {done}: it had {state}"))?;
+            }
             Ok(_) => say(format_args!("{id} {done}"))?,
             Err(error) => {
                 refused += 1;
@@ -212,7 +240,7 @@ async fn each(
         }
     }
     match refused {
-        0 => say(format_args!("{} jobs {done}", ids.len())),
+        0 => say(format_args!("{} jobs {done}", ids.len() - left)),
         _ => Err(Failure::internal(anyhow::anyhow!(
             "{refused} of {} jobs were not {done}",
             ids.len()

@@ -1,6 +1,8 @@
 //! `fnsf submit`: sweeps to a server, and the flow back.
 
+use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow};
 use clap::Args;
@@ -8,13 +10,17 @@ use reqwest::Method;
 use reqwest::multipart::{Form, Part};
 use serde_json::{Value, json};
 
-use super::client::{Client, ServerFlags, block_on};
+use super::client::{Client, ServerFlags, block_on, may_pass};
 use super::failure::Failure;
-use super::files;
+use super::files::{self, Output};
 use super::output::say;
 use super::terminal::Terminal;
-use super::unfinished::Unfinished;
 use crate::flow::{Control, Progress};
+
+/// How long a job is followed while its server cannot be reached.
+const RECONNECT: Duration = Duration::from_secs(60);
+/// Time between two attempts to reach the server.
+const PAUSE: Duration = Duration::from_secs(1);
 
 /// Submit sweeps to a server as a job, wait for its end and fetch the result.
 ///
@@ -60,6 +66,7 @@ pub(super) struct Submit {
 
 impl Submit {
     pub(super) fn run(&self) -> Result<(), Failure> {
+        files::check_outputs(&self.output, &self.sweeps)?;
         let client = self.server.client()?;
         let options = self.options().map_err(Failure::usage)?;
         block_on(self.answer(&client, &options))
@@ -89,7 +96,52 @@ impl Submit {
         Ok(options)
     }
 
+    /// The media type of the result, by the ending of the output.
+    async fn media_type(
+        &self,
+        client: &Client,
+        options: &Value,
+        output: &Path,
+    ) -> Result<String, Failure> {
+        let info = client.call(Method::GET, "/v1/info").await;
+        let mut info = info.map_err(Failure::internal)?;
+        let is_dense = !options["densify"].is_null();
+        let is_sequence = self.sweeps.len() > 2 || is_dense;
+        let kind = match is_sequence {
+            false => "flow",
+            true if is_dense => "dense",
+            true => "archive",
+        };
+        let formats = info["formats"][kind].take();
+        let formats = formats.as_array().into_iter().flatten();
+        let formats = formats.filter_map(|format| {
+            Some((
+                format["extension"].as_str()?,
+                format["media_type"].as_str()?,
+            ))
+        });
+        let archive = is_sequence.then_some(("zip", "application/zip"));
+        let formats: Vec<_> = formats.chain(archive).collect();
+        let ending = output.extension().unwrap_or_default().to_string_lossy();
+        let asked = formats
+            .iter()
+            .find(|(extension, _)| extension.eq_ignore_ascii_case(&ending));
+        asked
+            .map(|(_, media_type)| (*media_type).to_owned())
+            .ok_or_else(|| {
+                let endings: Vec<_> = formats.iter().map(|(ending, _)| *ending).collect();
+                let (output, endings) = (output.display(), endings.join(", ."));
+                Failure::usage(anyhow!(
+                    "cannot write {output}: the result of this job is a file of .{endings}"
+                ))
+            })
+    }
+
     async fn answer(&self, client: &Client, options: &Value) -> Result<(), Failure> {
+        let output = match &self.output {
+            None => None,
+            Some(output) => Some((output, self.media_type(client, options, output).await?)),
+        };
         let form = form(&self.sweeps, options)
             .await
             .map_err(Failure::bad_input)?;
@@ -107,7 +159,7 @@ impl Submit {
             .await
             .map_err(Failure::internal)?;
         let id = job["id"].as_str().unwrap_or_default();
-        let Some(output) = &self.output else {
+        let Some((output, media_type)) = output else {
             return say(format_args!("{id}"));
         };
         let terminal = Terminal::new();
@@ -123,7 +175,7 @@ impl Submit {
                 "job {id} ended as {state}: {why}"
             )));
         }
-        let fetched = fetch(client, &job, output)
+        let fetched = fetch(client, &job, &media_type, output)
             .await
             .map_err(Failure::internal)?;
         say(format_args!(
@@ -150,12 +202,16 @@ async fn form(sweeps: &[PathBuf], options: &Value) -> anyhow::Result<Form> {
 }
 
 /// Follows a job to its end. Returns its last state.
+///
+/// # Errors
+/// If the server refuses, or cannot be reached for [`RECONNECT`].
 pub(super) async fn until_ended(
     client: &Client,
     job: &Value,
     terminal: &Terminal,
 ) -> anyhow::Result<Value> {
     let link = |name: &str| job["links"][name].as_str().unwrap_or_default().to_owned();
+    let mut lost: Option<Instant> = None;
     loop {
         let mut last = Value::Null;
         let followed = client
@@ -171,11 +227,20 @@ pub(super) async fn until_ended(
         if last["finished_at"].is_string() {
             return Ok(last);
         }
-        let job = client
-            .call(Method::GET, &format!("{}?wait=20", link("self")))
-            .await?;
-        if job["finished_at"].is_string() {
-            return Ok(job);
+        let path = format!("{}?wait=20", link("self"));
+        match client.call(Method::GET, &path).await {
+            Ok(job) if job["finished_at"].is_string() => return Ok(job),
+            Ok(_) => lost = None,
+            Err(error)
+                if may_pass(&error)
+                    && lost.get_or_insert_with(Instant::now).elapsed() < RECONNECT =>
+            {
+                tokio::time::sleep(PAUSE).await;
+            }
+            Err(error) => {
+                let id = job["id"].as_str().unwrap_or_default();
+                return Err(error.context(format!("job {id} is no longer followed")));
+            }
         }
     }
 }
@@ -189,33 +254,22 @@ fn progress(data: &Value) -> Progress {
     }
 }
 
-/// Fetches the result of a job into a file, in the format of the file's extension. Returns its bytes.
-async fn fetch(client: &Client, job: &Value, output: &Path) -> anyhow::Result<u64> {
-    let info = client.call(Method::GET, "/v1/info").await?;
-    let extension = output
-        .extension()
-        .and_then(|ending| ending.to_str())
-        .unwrap_or("npz");
-    let formats = ["flow", "dense"].map(|kind| info["formats"][kind].as_array().cloned());
-    let formats = formats.into_iter().flatten().flatten();
-    let media_type = formats
-        .into_iter()
-        .find(|format| format["extension"] == extension)
-        .and_then(|format| Some(format["media_type"].as_str()?.to_owned()));
+/// Fetches the result of a job into a file. Returns its bytes.
+async fn fetch(
+    client: &Client,
+    job: &Value,
+    media_type: &str,
+    output: &Path,
+) -> anyhow::Result<u64> {
     let link = job["links"]["result"].as_str().unwrap_or_default();
     let request = client.request(Method::GET, link)?;
-    let request = match &media_type {
-        Some(media_type) => request.header("accept", media_type),
-        None => request,
-    };
-    let mut response = client.send(request).await?;
-    let place = files::place_of(output).context("the folder of the output is not there")?;
-    let (unfinished, mut file) = Unfinished::beside(&place)?;
+    let mut response = client.send(request.header("accept", media_type)).await?;
+    let mut written = Output::create(output)?;
     let mut bytes = 0;
     while let Some(piece) = response.chunk().await? {
-        std::io::Write::write_all(&mut file, &piece)?;
+        written.file.write_all(&piece)?;
         bytes += piece.len() as u64;
     }
-    unfinished.rename(&place)?;
+    written.complete()?;
     Ok(bytes)
 }

@@ -341,3 +341,42 @@ fn tracks_of_another_sequence_and_sweeps_of_one_name_are_refused_before_anything
     }
     assert!(!folder.join("out").exists());
 }
+
+#[test]
+fn no_input_is_written_over_and_a_cloud_in_its_place_stays() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    drive(folder);
+    fs::create_dir(folder.join("lidar")).expect("a folder");
+    let sweeps = sweeps().map(|sweep| {
+        let place = format!("lidar/{sweep}");
+        fs::rename(folder.join(sweep), folder.join(&place)).expect("moved");
+        place
+    });
+    let sweeps: Vec<&str> = sweeps.iter().map(String::as_str).collect();
+    let before = fs::metadata(folder.join(sweeps[0])).expect("a sweep");
+    let options = ["--layout", "sustechpoints", "-o", ".", "--class", "Car"];
+    let export = |tracks: &str, options: &[&str]| {
+        fnsf(
+            folder,
+            &[&["export", tracks], &sweeps[..], options].concat(),
+        )
+    };
+    let done = export("tracks.json", &options);
+    assert_eq!(done.code, 0, "{}", done.stderr);
+    let after = fs::metadata(folder.join(sweeps[0])).expect("a sweep");
+    assert_eq!(
+        before.modified().expect("a time"),
+        after.modified().expect("a time")
+    );
+    // The recording would have the name of the tracks.
+    fs::rename(folder.join("tracks.json"), folder.join("scene.mcap")).expect("moved");
+    let tracks = fs::read(folder.join("scene.mcap")).expect("tracks");
+    let done = export(
+        "scene.mcap",
+        &["--layout", "mcap", "-o", ".", "--class", "Car"],
+    );
+    assert_eq!(done.code, 2, "{}", done.stderr);
+    assert!(done.stderr.contains("written over"), "{}", done.stderr);
+    assert_eq!(fs::read(folder.join("scene.mcap")).expect("tracks"), tracks);
+}

@@ -118,33 +118,89 @@ fn sweeps_get_the_flows_of_the_sequence_however_they_come_into_the_folder() {
 
 #[test]
 fn a_damaged_sweep_is_named_and_the_sequence_starts_again_after_it() {
-    let folder = prepared("4");
+    for preset in ["default", "label"] {
+        let folder = prepared("4");
+        let folder = folder.path();
+        let put = |name: &str, bytes: &[u8]| {
+            std::fs::write(folder.join("incoming").join(name), bytes).expect("written");
+        };
+        put("0.pcd", &sweep(folder, 0));
+        put("1.pcd", &sweep(folder, 1));
+        put("2.pcd", &sweep(folder, 2)[..5000]);
+        put("3.pcd", &sweep(folder, 2));
+        put("4.pcd", &sweep(folder, 3));
+        let options = ["--dt", "0.1", "--preset", preset];
+        let (output, reports, stderr) = ended(follow(folder, &options));
+        assert!(output.status.success(), "{stderr}");
+        assert!(
+            stderr.contains("2.pcd") && stderr.contains("starts again"),
+            "{stderr}"
+        );
+        assert_eq!(names(&reports), [["0.pcd", "1.pcd"], ["3.pcd", "4.pcd"]]);
+    }
+}
+
+/// The names of the sweeps in reports.
+fn names(reports: &[serde_json::Value]) -> Vec<[&str; 2]> {
+    let mut names = Vec::new();
+    for report in reports {
+        names.push([0, 1].map(|index| report["sweeps"][index].as_str().expect("a name")));
+    }
+    names
+}
+
+#[test]
+fn a_pair_that_is_refused_costs_no_other_pair() {
+    let folder = prepared("2");
     let folder = folder.path();
-    let put = |name: &str, bytes: &[u8]| {
-        std::fs::write(folder.join("incoming").join(name), bytes).expect("written");
-    };
-    put("0.pcd", &sweep(folder, 0));
-    put("1.pcd", &sweep(folder, 1));
-    put("2.pcd", &sweep(folder, 2)[..5000]);
-    put("3.pcd", &sweep(folder, 2));
-    put("4.pcd", &sweep(folder, 3));
-    let (output, reports, stderr) = ended(follow(folder, &["--dt", "0.1"]));
+    for number in 0..2 {
+        let name = format!("incoming/{number}.pcd");
+        std::fs::write(folder.join(name), sweep(folder, number)).expect("written");
+    }
+    // Another street.
+    let done = fnsf(
+        folder,
+        &[
+            "synth", "-o", "other", "--sweeps", "4", "--beams", "16", "--seed", "77",
+        ],
+    );
+    assert_eq!(done.code, 0, "{}", done.stderr);
+    for number in 0..4 {
+        let from = folder.join(format!("other/sweep_{number:04}.pcd"));
+        let to = folder.join(format!("incoming/{}.pcd", number + 2));
+        std::fs::rename(from, to).expect("moved");
+    }
+    let options = ["--dt", "0.1", "--preset", "label"];
+    let (output, reports, stderr) = ended(follow(folder, &options));
     assert!(output.status.success(), "{stderr}");
-    assert!(
-        stderr.contains("2.pcd") && stderr.contains("starts again"),
-        "{stderr}"
-    );
-    let names: Vec<_> = reports
-        .iter()
-        .map(|report| report["sweeps"].clone())
-        .collect();
-    assert_eq!(
-        names,
-        [
-            serde_json::json!(["0.pcd", "1.pcd"]),
-            serde_json::json!(["3.pcd", "4.pcd"])
-        ]
-    );
+    assert!(stderr.contains("1.pcd to 2.pcd"), "{stderr}");
+    // The target of the refused pair may be the bad one of the two.
+    let expected = [["0.pcd", "1.pcd"], ["3.pcd", "4.pcd"], ["4.pcd", "5.pcd"]];
+    assert_eq!(names(&reports), expected);
+}
+
+#[test]
+fn a_sweep_that_is_being_written_at_the_start_is_taken_when_it_is_complete() {
+    let folder = prepared("2");
+    let folder = folder.path();
+    std::fs::write(folder.join("incoming/0.pcd"), sweep(folder, 0)).expect("written");
+    let whole = sweep(folder, 1);
+    let mut file = std::fs::File::create(folder.join("incoming/1.pcd")).expect("a file");
+    let mut pieces = whole.chunks(whole.len().div_ceil(80));
+    let mut write = |count: usize| {
+        for piece in pieces.by_ref().take(count) {
+            std::io::Write::write_all(&mut file, piece).expect("written");
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    };
+    write(1);
+    let child = follow(folder, &[]);
+    write(usize::MAX);
+    drop(file);
+    let (output, reports, stderr) = ended(child);
+    assert!(output.status.success(), "{stderr}");
+    assert!(!stderr.contains("warning"), "{stderr}");
+    assert_eq!(names(&reports), [["0.pcd", "1.pcd"]]);
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! Tests of `fnsf submit` and `fnsf jobs` against a server.
 
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
 
 use fnsf::formats::CloudFormat;
 use serde_json::Value;
@@ -111,6 +111,111 @@ fn sweeps_are_submitted_and_jobs_listed_shown_cancelled_requeued_and_removed() {
         run(&["jobs", "list", "--label", "drive=7"]).lines().count(),
         1
     );
+}
+
+/// A folder with two sweeps, `a.pcd` and `b.pcd`.
+fn with_two_sweeps() -> Folder {
+    let folder = Folder::new();
+    for (name, points) in ["a.pcd", "b.pcd"].iter().zip(small_pair()) {
+        std::fs::write(folder.path().join(name), file(CloudFormat::Pcd, points)).expect("a file");
+    }
+    folder
+}
+
+#[test]
+fn an_output_is_checked_before_anything_is_sent() {
+    let server = Server::with_config(&format!("api_key = \"{KEY}\"\n"));
+    let folder = with_two_sweeps();
+    let run = |arguments: &[&str]| fnsf(&server, folder.path(), KEY, arguments);
+    let b = std::fs::read(folder.path().join("b.pcd")).expect("a sweep");
+    for (arguments, code, what) in [
+        (
+            &["submit", "a.pcd", "b.pcd", "-o", "b.pcd"][..],
+            2,
+            "written over",
+        ),
+        (
+            &["submit", "a.pcd", "b.pcd", "-o", "gone/f.npz"],
+            70,
+            "folder is not there",
+        ),
+        (&["submit", "a.pcd", "b.pcd", "-o", "flow.xyz"], 2, ".npz"),
+        (&["submit", "a.pcd", "b.pcd", "-o", "flow"], 2, ".npz"),
+        (
+            &["submit", "a.pcd", "b.pcd", "a.pcd", "-o", "flows.npz"],
+            2,
+            ".zip",
+        ),
+    ] {
+        let ended = run(arguments);
+        let said = text(&ended.stderr);
+        assert_eq!(ended.status.code(), Some(code), "{arguments:?}: {said}");
+        assert!(said.contains(what), "{arguments:?}: {said}");
+    }
+    assert_eq!(
+        std::fs::read(folder.path().join("b.pcd")).expect("a sweep"),
+        b
+    );
+    assert_eq!(text(&run(&["jobs", "list"]).stdout), "");
+
+    // An ending in capitals is the same, and a pipe is written as it is.
+    let ended = run(&["submit", "a.pcd", "b.pcd", "-o", "flow.PLY"]);
+    assert!(ended.status.success(), "{}", text(&ended.stderr));
+    let flow = std::fs::read(folder.path().join("flow.PLY")).expect("a flow");
+    assert!(flow.starts_with(b"ply"));
+    let pipe = folder.path().join("pipe.ply");
+    let made = Command::new("mkfifo").arg(&pipe).status();
+    assert!(made.expect("mkfifo").success());
+    let reader = std::thread::spawn({
+        let pipe = pipe.clone();
+        move || std::fs::read(pipe)
+    });
+    let ended = run(&["submit", "a.pcd", "b.pcd", "-o", "pipe.ply"]);
+    assert!(ended.status.success(), "{}", text(&ended.stderr));
+    let read = reader.join().expect("no panic").expect("a flow");
+    assert_eq!(read, flow);
+
+    // A job that has ended is not cancelled, and is not said to be.
+    let id = text(&run(&["jobs", "list"]).stdout);
+    let id = id.split_whitespace().next().expect("a job").to_owned();
+    let cancelled = text(&run(&["jobs", "cancel", &id]).stdout);
+    assert!(cancelled.contains("it had succeeded"), "{cancelled}");
+    assert!(cancelled.contains("0 jobs cancelled"), "{cancelled}");
+    let cancelled = text(&run(&["jobs", "cancel", "--state", "succeeded"]).stdout);
+    assert_eq!(cancelled, "0 jobs cancelled\n");
+}
+
+#[test]
+fn a_submission_outlives_a_restart_of_its_server() {
+    let config = format!("api_key = \"{KEY}\"\n");
+    let server = Server::with_config(&config);
+    let folder = with_two_sweeps();
+    let long = r#"{"field": {"max_iterations": 1500, "patience": 1500}}"#;
+    let submitted = Command::new(env!("CARGO_BIN_EXE_fnsf"))
+        .args([
+            "submit", "a.pcd", "b.pcd", "-o", "flow.npz", "--preset", "paper",
+        ])
+        .args(["--options", long])
+        .current_dir(folder.path())
+        .env("FNSF_SERVER", server.url("/"))
+        .env("FNSF_API_KEY", KEY)
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("it runs");
+    server.until("the job runs", || {
+        let running = fnsf(
+            &server,
+            folder.path(),
+            KEY,
+            &["jobs", "list", "--state", "running"],
+        );
+        !running.stdout.is_empty()
+    });
+    let _server = server.killed_and_started(&config);
+    let ended = submitted.wait_with_output().expect("it ends");
+    assert!(ended.status.success(), "{}", text(&ended.stderr));
+    assert!(folder.path().join("flow.npz").exists());
 }
 
 #[test]

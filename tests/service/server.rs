@@ -84,13 +84,34 @@ impl Server {
         Self::start_as(program, folder, config, &[])
     }
 
-    fn start_as(mut program: Command, folder: &Folder, config: &str, arguments: &[&str]) -> Self {
+    fn start_as(program: Command, folder: &Folder, config: &str, arguments: &[&str]) -> Self {
+        Self::start_on(program, &FREE_PORTS, folder, config, arguments)
+    }
+
+    /// Kills the server as a crash would, and starts it again on the same public port.
+    pub(crate) fn killed_and_started(self, config: &str) -> Self {
+        let public = self.public.clone();
+        let folder = self.kill();
+        let program = Command::new(env!("CARGO_BIN_EXE_fnsf"));
+        let mut ports = FREE_PORTS;
+        ports[2] = &public;
+        Self::start_on(program, &ports, &folder, config, &[])
+    }
+
+    /// Starts a server with the command and the ports that `serve` names.
+    fn start_on(
+        mut program: Command,
+        serve: &[&str],
+        folder: &Folder,
+        config: &str,
+        arguments: &[&str],
+    ) -> Self {
         // The clients of the tests need one.
         let _is_named = rustls::crypto::ring::default_provider().install_default();
         let file: PathBuf = folder.path().join("fnsf.toml");
         std::fs::write(&file, config).expect("a file");
         let mut child = program
-            .args(FREE_PORTS)
+            .args(serve)
             .arg("--data-dir")
             .arg(folder.path().join("data"))
             .arg("--config")

@@ -1,6 +1,6 @@
 //! `fnsf flow --follow`: the sweeps of a folder in the order in which they are written.
 
-use std::collections::{HashSet, VecDeque};
+use std::collections::{HashMap, VecDeque};
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
@@ -21,13 +21,16 @@ use crate::formats::compare_names;
 const BETWEEN_WARNINGS: Duration = Duration::from_secs(10);
 /// Number of waiting sweeps from which flows take too long.
 const BEHIND: usize = 2;
+/// Time without a change after which a file that was there before is complete. Nothing tells when it was closed.
+const SETTLED: Duration = Duration::from_secs(1);
 
 /// Options of a folder that is followed.
 #[derive(Clone, Debug, Args)]
 pub(super) struct FollowArguments {
     /// Folder whose sweeps are taken as they are written, first those that are there. A sweep is
-    /// taken when its file is closed (on Linux) or moved into the folder under its name. Names that
-    /// begin with a dot or end in .tmp or .part are left alone. Ends by Ctrl-C, or by --idle-s
+    /// taken when its file is closed (on Linux) or moved into the folder under its name, one that is
+    /// there when it has not changed for a second. Names that begin with a dot or end in .tmp or
+    /// .part are left alone. Ends by Ctrl-C, or by --idle-s
     #[arg(
         long,
         value_name = "DIR",
@@ -88,14 +91,18 @@ pub(super) struct Arrived {
     pub(super) written: SystemTime,
 }
 
+/// The size of a file, and when it was last written.
+type Version = (u64, SystemTime);
+
 /// The sweeps of a folder.
 pub(super) struct Arrivals {
     events: Receiver<notify::Result<Event>>,
     /// Reports the events as long as it lives.
     _watcher: Box<dyn Watcher>,
     waiting: VecDeque<PathBuf>,
-    /// The sweeps that were there before, whose late events are left alone.
-    present: HashSet<PathBuf>,
+    /// The sweeps that were there before, each as it was when it was taken. Late events of what was taken are
+    /// left alone.
+    present: HashMap<PathBuf, Option<Version>>,
     idle: Option<Duration>,
     can_be_due: bool,
     warned: Option<Instant>,
@@ -105,6 +112,10 @@ impl Arrivals {
     /// Begins to watch a folder.
     pub(super) fn watch(folder: &Path, arguments: &FollowArguments) -> Result<Self, Failure> {
         let named = || folder.display().to_string();
+        // The paths of events are absolute.
+        let folder = &std::path::absolute(folder)
+            .with_context(named)
+            .map_err(Failure::bad_input)?;
         let (sender, events) = channel();
         let watched = notify::recommended_watcher(sender).and_then(|mut watcher| {
             watcher.watch(folder, RecursiveMode::NonRecursive)?;
@@ -122,7 +133,7 @@ impl Arrivals {
         Ok(Self {
             events,
             _watcher: Box::new(watcher),
-            present: paths.iter().cloned().collect(),
+            present: paths.iter().cloned().map(|path| (path, None)).collect(),
             waiting: paths.into(),
             idle: arguments.idle_s,
             can_be_due: arguments.due_ms.is_some(),
@@ -142,22 +153,30 @@ impl Arrivals {
             while let Ok(event) = self.events.try_recv() {
                 self.add(event)?;
             }
-            if let Some(path) = self.waiting.pop_front() {
+            let settles = self.waiting.front().and_then(|path| self.settles_in(path));
+            if settles.is_none()
+                && let Some(path) = self.waiting.pop_front()
+            {
                 self.warn();
+                let version = version(&path);
+                if let Some(taken) = self.present.get_mut(&path) {
+                    *taken = version;
+                }
                 // A sweep that is gone is refused when it is read.
-                let written = path.metadata().and_then(|file| file.modified());
-                let written = written.unwrap_or_else(|_| SystemTime::now());
+                let written = version.map_or_else(SystemTime::now, |(_, written)| written);
                 return Ok(Some(Arrived { path, written }));
             }
-            let left = match self.idle {
-                None => Duration::MAX,
-                Some(idle) => idle.saturating_sub(asked.elapsed()),
+            let left = match (settles, self.idle) {
+                (Some(left), _) => left,
+                (None, None) => Duration::MAX,
+                (None, Some(idle)) => idle.saturating_sub(asked.elapsed()),
             };
             match self
                 .events
                 .recv_timeout(left.min(Duration::from_secs(3600)))
             {
                 Ok(event) => self.add(event)?,
+                Err(RecvTimeoutError::Timeout) if settles.is_some() => {}
                 Err(RecvTimeoutError::Timeout)
                     if self.idle.is_some_and(|idle| asked.elapsed() >= idle) =>
                 {
@@ -187,20 +206,36 @@ impl Arrivals {
         if !completes(event.kind) {
             return Ok(());
         }
-        if let Some(path) = event.paths.into_iter().next()
-            && is_sweep(&path)
-            && !self.present.remove(&path)
-            // Reading a pipe may never end.
-            && path.is_file()
-        {
-            self.waiting.push_back(path);
+        let Some(path) = event.paths.into_iter().next() else {
+            return Ok(());
+        };
+        // Reading a pipe may never end.
+        if !is_sweep(&path) || !path.is_file() {
+            return Ok(());
+        }
+        match self.present.get(&path) {
+            // It waits, and is complete.
+            Some(None) => drop(self.present.remove(&path)),
+            Some(taken) if *taken == version(&path) => {}
+            _ => self.waiting.push_back(path),
         }
         Ok(())
     }
 
+    /// The time after which a sweep that was there before is complete, if nothing more is written. None if it
+    /// is complete.
+    fn settles_in(&self, path: &Path) -> Option<Duration> {
+        let (_, written) = match self.present.get(path)? {
+            None => version(path)?,
+            Some(_) => return None,
+        };
+        let left = SETTLED.checked_sub(written.elapsed().ok()?)?;
+        (!left.is_zero()).then_some(left)
+    }
+
     /// Says that flows take longer than the time between the sweeps that come.
     fn warn(&mut self) {
-        let came = |path: &&PathBuf| !self.present.contains(*path);
+        let came = |path: &&PathBuf| !self.present.contains_key(*path);
         let count = self.waiting.iter().filter(came).count();
         let is_due = self
             .warned
@@ -218,6 +253,12 @@ impl Arrivals {
              sweeps: {advice}"
         ));
     }
+}
+
+/// The version of a file. None if it is gone.
+fn version(path: &Path) -> Option<Version> {
+    let file = path.metadata().ok()?;
+    Some((file.len(), file.modified().ok()?))
 }
 
 /// Whether a file is complete after an event of this kind.

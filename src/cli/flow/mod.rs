@@ -7,11 +7,12 @@ mod pairs;
 mod print;
 
 use std::path::Path;
+use std::sync::Arc;
 
 pub(super) use self::arguments::Flow;
 use self::follow::{Arrivals, Latencies};
 use self::output::Arrival;
-use self::pairs::{Pairs, Taken};
+use self::pairs::{Pairs, Taken, warn};
 pub(super) use self::print::print_report;
 use super::estimation::check_sequence;
 use super::failure::Failure;
@@ -50,13 +51,13 @@ impl Flow {
                         ground,
                         times: None,
                     };
-                    pairs.push(&sweep, Taken::default())?;
+                    pairs.push(&Arc::new(sweep), Taken::default())?;
                 }
             }
             None => {
                 for path in &self.sweeps {
                     let (sweep, taken) = pairs.read(path)?;
-                    pairs.push(&sweep, taken)?;
+                    pairs.push(&Arc::new(sweep), taken)?;
                 }
             }
         }
@@ -74,31 +75,29 @@ impl Flow {
         while let Some(arrived) = arrivals.next()? {
             let waiting = arrivals.waiting();
             pairs.surroundings.add(&arrived.path);
-            let taken = pairs.read(&arrived.path).and_then(|(sweep, taken)| {
-                let taken = Taken {
-                    arrived: Some(Arrival {
-                        due_s: self.follow.due_s(&arrived, pairs.terminal.seconds()),
-                        written: arrived.written,
-                        waiting,
-                    }),
-                    ..taken
-                };
-                pairs.push(&sweep, taken)
-            });
-            match taken {
-                Ok(()) => latencies.add(&pairs.take_latencies()),
-                // One bad sweep is no reason to miss all later ones.
+            // One bad sweep is no reason to miss all later ones.
+            match pairs.read(&arrived.path) {
+                Ok((sweep, taken)) => {
+                    let taken = Taken {
+                        arrived: Some(Arrival {
+                            due_s: self.follow.due_s(&arrived, pairs.terminal.seconds()),
+                            written: arrived.written,
+                            waiting,
+                        }),
+                        ..taken
+                    };
+                    pairs.push_or_warn(&Arc::new(sweep), taken)?;
+                }
                 Err(failure) if failure.is_of_input() => {
-                    let path = arrived.path.display();
-                    complain(format_args!(
-                        "warning: {path}: {failure}; the sequence starts again after it"
-                    ));
+                    pairs.flush_or_warn()?;
+                    warn(&arrived.path.display(), &failure);
                     pairs.restart();
                 }
                 Err(failure) => return Err(failure),
             }
+            latencies.add(&pairs.take_latencies());
         }
-        pairs.flush()?;
+        pairs.flush_or_warn()?;
         latencies.add(&pairs.take_latencies());
         complain(format_args!("{latencies}"));
         Ok(())

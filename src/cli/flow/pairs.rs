@@ -1,6 +1,7 @@
 //! The pairs of a sequence: takes sweeps one by one, and writes each flow as soon as it is complete.
 
 use std::collections::VecDeque;
+use std::fmt;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -11,6 +12,7 @@ use super::output::{Arrival, Complete, put};
 use crate::cli::estimation::{Device, Surroundings};
 use crate::cli::failure::Failure;
 use crate::cli::machine::peak_resident_bytes;
+use crate::cli::output::complain;
 use crate::cli::terminal::Terminal;
 use crate::cli::tracks::Tracking;
 use crate::flow::{Control, Estimate, Interrupt, Point, Progress, Sequence, Sweep};
@@ -33,6 +35,8 @@ struct Waiting {
     points: [Arc<[Point]>; 2],
     names: [String; 2],
     target: Taken,
+    /// The target as it was read, should the sequence start again with it.
+    sweep: Arc<Sweep>,
 }
 
 /// The pairs of a sequence that is read sweep by sweep.
@@ -106,7 +110,7 @@ impl<'a> Pairs<'a> {
     }
 
     /// Adds the next sweep, and writes the flows that are complete with it.
-    pub(super) fn push(&mut self, sweep: &Sweep, taken: Taken) -> Result<(), Failure> {
+    pub(super) fn push(&mut self, sweep: &Arc<Sweep>, taken: Taken) -> Result<(), Failure> {
         let index = self.sweeps;
         self.sweeps += 1;
         let points: Arc<[Point]> = sweep.points.as_slice().into();
@@ -129,6 +133,7 @@ impl<'a> Pairs<'a> {
                 names: [name, taken.name.clone()],
                 points: [source, points],
                 target: taken,
+                sweep: Arc::clone(sweep),
             });
         }
         let found = self
@@ -136,6 +141,46 @@ impl<'a> Pairs<'a> {
             .push(&mut self.sequence, sweep, &options, &due)?;
         // Complete pairs are written before the next one is estimated, which may fail.
         self.write(found)
+    }
+
+    /// Adds the next sweep, and goes on after a pair that is refused.
+    pub(super) fn push_or_warn(&mut self, sweep: &Arc<Sweep>, taken: Taken) -> Result<(), Failure> {
+        let pushed = self.push(sweep, taken);
+        self.go_on(pushed)
+    }
+
+    /// Writes the flows that wait for sweeps that do not come, and goes on after a pair that is refused.
+    pub(super) fn flush_or_warn(&mut self) -> Result<(), Failure> {
+        loop {
+            match self.flush() {
+                Err(failure) if failure.is_of_input() => self.go_on(Err(failure))?,
+                flushed => return flushed,
+            }
+        }
+    }
+
+    /// Warns of a pair that was refused. The sequence starts again with the first sweep after the pair.
+    fn go_on(&mut self, mut done: Result<(), Failure>) -> Result<(), Failure> {
+        let mut later: VecDeque<(Arc<Sweep>, Taken)> = VecDeque::new();
+        loop {
+            if let Err(failure) = &done
+                && failure.is_of_input()
+                && let Some(refused) = self.waiting.pop_front()
+            {
+                let [source, target] = &refused.names;
+                warn(&format_args!("{source} to {target}"), failure);
+                let waiting = core::mem::take(&mut self.waiting).into_iter();
+                let mut waiting: VecDeque<_> = waiting.map(|one| (one.sweep, one.target)).collect();
+                waiting.append(&mut later);
+                later = waiting;
+                self.restart_at(refused.pair + 2);
+                done = Ok(());
+            }
+            match later.pop_front() {
+                Some((sweep, taken)) if done.is_ok() => done = self.push(&sweep, taken),
+                _ => return done,
+            }
+        }
     }
 
     /// Writes the flows that wait for sweeps that do not come.
@@ -159,10 +204,15 @@ impl<'a> Pairs<'a> {
 
     /// Begins a new sequence with the next sweep.
     pub(super) fn restart(&mut self) {
+        self.restart_at(self.surroundings.end());
+    }
+
+    /// Begins a new sequence with the sweep of index `index`.
+    fn restart_at(&mut self, index: usize) {
         self.sequence = Sequence::default();
         self.waiting.clear();
         self.last = None;
-        self.sweeps = self.surroundings.end();
+        self.sweeps = index;
     }
 
     /// Seconds from the last byte of a sweep to its flow, of the flows since the last call.
@@ -229,4 +279,11 @@ impl Control for Due<'_> {
     fn progress(&self, progress: Progress) {
         self.terminal.progress(progress);
     }
+}
+
+/// Warns that `what`, a sweep or a pair, cannot be used.
+pub(super) fn warn(what: &dyn fmt::Display, failure: &Failure) {
+    complain(format_args!(
+        "warning: {what}: {failure}; the sequence starts again after it"
+    ));
 }
