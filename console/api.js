@@ -28,6 +28,12 @@ export function isShared() {
   return shareToken !== null;
 }
 
+/** The address of a job's page; with a share link, for the same reader. */
+export function jobAddress(id) {
+  const page = `#/jobs/${id}`;
+  return isShared() ? `${page}?token=${encodeURIComponent(shareToken)}` : page;
+}
+
 /** A refused or failed request, with the words of the server. */
 export class Refusal extends Error {
   /**

@@ -2,6 +2,7 @@
  * The life of a job: its times, attempts, phases, device and options.
  */
 
+import { jobAddress } from "../api.js";
 import { el } from "../dom.js";
 import { between, count, duration, moment } from "../text.js";
 
@@ -86,7 +87,7 @@ function resultOf(job) {
 function pairLinks(job) {
   const pairs = (job.pairs?.jobs ?? []).filter((pair) => ["failed", "cancelled", "expired"].includes(pair.state));
   if (pairs.length === 0) return null;
-  return el("span", {}, pairs.map((pair, index) => [index > 0 ? ", " : "", el("a", { href: `#/jobs/${pair.id}` }, pair.state)]));
+  return el("span", {}, pairs.map((pair, index) => [index > 0 ? ", " : "", el("a", { href: jobAddress(pair.id) }, pair.state)]));
 }
 
 function optionsOf(job) {

@@ -2,6 +2,7 @@
  * The options of a submission as a form, with their defaults and meanings.
  */
 
+import { Refusal } from "../api.js";
 import { el, field, select } from "../dom.js";
 
 const PRESETS = {
@@ -53,7 +54,7 @@ export function optionsForm(presets) {
   const crop = number({ min: "0", step: "any", placeholder: "none" });
   const interval = number({ min: "0", step: "any", placeholder: "file names, else 0.1" });
   const deadline = number({ min: "1", step: "1", placeholder: "none" });
-  const seed = number({ min: "0", step: "1", placeholder: "0" });
+  const seed = number({ min: "0", max: Number.MAX_SAFE_INTEGER, step: "1", placeholder: "0", data: { test: "seed" } });
   const labels = el("input", { type: "text", placeholder: "drive=7, split=val", data: { test: "labels" } });
   const dense = el("input", { type: "checkbox", data: { test: "densify" } });
   const force = el("input", { type: "checkbox" });
@@ -88,7 +89,7 @@ export function optionsForm(presets) {
     put("crop_m", crop, Number);
     put("dt_s", interval, Number);
     put("deadline_ms", deadline, Number);
-    put("seed", seed, Number);
+    put("seed", seed, readSeed);
     put("labels", labels, readLabels);
     if (dense.checked) options.densify = {};
     if (force.checked) options.force = true;
@@ -98,6 +99,13 @@ export function optionsForm(presets) {
 }
 
 /** Labels from `name=value, name=value`. */
+function readSeed(text) {
+  const seed = Number(text);
+  // JavaScript's numbers hold no larger ones exactly.
+  if (Number.isSafeInteger(seed) && seed >= 0) return seed;
+  throw new Refusal(0, { detail: `a seed is a whole number from 0 to ${Number.MAX_SAFE_INTEGER}` });
+}
+
 function readLabels(text) {
   const pairs = text.split(",").filter((part) => part.trim() !== "");
   return Object.fromEntries(

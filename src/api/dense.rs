@@ -184,15 +184,14 @@ impl Service {
         }
         Self::check_success(job)?;
         let room = self.room_for_result(job).await?;
-        let turn = Arc::clone(&self.clouds).acquire_owned().await;
-        let turn = turn.map_err(ApiError::internal)?;
+        let turn = self.clouds.wait(&job.tenant).await;
         if let Some(made) = self.answers.made(&name) {
             return Ok(made);
         }
         let began = std::time::Instant::now();
         let stored = self.result_bytes(job).await?;
         let id = job.id;
-        let encode = move || {
+        let encode = move || -> Result<Encoded, ApiError> {
             // The work goes on when its caller has gone, and so do its turn and its memory.
             let _turn = turn;
             let cloud = decoded(id, &stored)?;
@@ -201,7 +200,9 @@ impl Service {
             write_dense(format, &cloud, None, &mut bytes).map_err(ApiError::internal)?;
             Ok(room.hold(bytes))
         };
-        let encoded = self.compute(&job.tenant, encode).await?;
+        // The turn of clouds is one for all tenants, and waits for no other.
+        let encoded = tokio::task::spawn_blocking(encode).await;
+        let encoded = encoded.map_err(ApiError::internal)??;
         self.answers.keep(name, &encoded);
         self.metrics
             .phase("encode", began.elapsed().as_secs_f64(), Some(job));

@@ -1,11 +1,11 @@
-//! Lists of jobs, page by page.
+//! Lists of jobs: those of a tenant page by page, and the pairs of a sequence.
 
 use std::sync::Arc;
 
 use super::auth::Caller;
 use super::error::ApiError;
 use super::service::Service;
-use crate::job::{Job, JobId, State};
+use crate::job::{Job, JobId, Kind, State};
 use crate::queue::Filter;
 
 /// Options and reports of the jobs on one page, bytes.
@@ -37,7 +37,10 @@ impl Service {
             before,
             limit,
         };
-        let mut jobs = self.queue.list(filter).await?;
+        let mut jobs = {
+            let _turn = self.scans.wait(&caller.tenant).await;
+            self.queue.list(filter).await?
+        };
         let mut bytes = 0;
         let mut fits = |job: &Arc<Job>| {
             let report = job.report.as_ref().map_or(0, String::len);
@@ -50,5 +53,30 @@ impl Service {
         jobs.truncate(fitting);
         let next = jobs.last().map(|job| job.id).filter(|_| !is_last);
         Ok((jobs, next))
+    }
+
+    /// The forward pairs of a sequence in order. Empty for a pair.
+    ///
+    /// # Errors
+    /// [`ApiError::StoreUnavailable`], [`ApiError::DiskFull`] or [`ApiError::Draining`] if the
+    /// queue fails or is closed.
+    pub async fn pairs(&self, job: &Job) -> Result<Vec<Arc<Job>>, ApiError> {
+        match job.kind {
+            Kind::Pair => Ok(Vec::new()),
+            Kind::Sequence => {
+                let mut pairs = self.all_pairs(job).await?;
+                pairs.retain(|pair| !pair.backward);
+                Ok(pairs)
+            }
+        }
+    }
+
+    /// The forward and backward pairs of a sequence. Empty for a pair.
+    ///
+    /// # Errors
+    /// As [`Self::pairs`].
+    pub(super) async fn all_pairs(&self, job: &Job) -> Result<Vec<Arc<Job>>, ApiError> {
+        let _turn = self.scans.wait(&job.tenant).await;
+        Ok(self.queue.pairs(job.id).await?)
     }
 }

@@ -6,7 +6,7 @@
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, Weak};
+use std::sync::{Arc, Mutex, OnceLock, Weak};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
@@ -25,7 +25,7 @@ const UNIT: usize = 1 << 10;
 /// the same result.
 const KEPT: usize = 4;
 
-/// Age below which a result is not evicted, however slow its reader is.
+/// Time for which a result is sent before it may be evicted, however slow its reader is.
 const GRACE: Duration = Duration::from_secs(10);
 
 /// Interval at which a request that waits for memory tries again.
@@ -46,7 +46,7 @@ pub(super) struct ResultLimits {
     pub(super) shared: bool,
     /// Maximum time that a result waits for memory.
     pub(super) patience: Duration,
-    /// Age below which a result is not evicted.
+    /// Time for which a result is sent before it may be evicted.
     pub(super) grace: Duration,
 }
 
@@ -79,10 +79,11 @@ pub(super) struct ResultReservation {
     taking: Arc<ReadProgress>,
 }
 
-/// The read progress of one result.
+/// The read progress of one result. A result that is not sent yet has no reader to be slow: it is never evicted.
 pub(super) struct ReadProgress {
     tenant: Tenant,
-    since: Instant,
+    /// When its first piece was offered to a client.
+    since: OnceLock<Instant>,
     bytes: AtomicU64,
     evicted: CancellationToken,
 }
@@ -170,7 +171,7 @@ impl ResultBudget {
         *held.entry(tenant.clone()).or_default() += units;
         let taking = Arc::new(ReadProgress {
             tenant: tenant.clone(),
-            since: Instant::now(),
+            since: OnceLock::new(),
             bytes: AtomicU64::new(0),
             evicted: CancellationToken::new(),
         });
@@ -203,7 +204,7 @@ impl ResultBudget {
             .collect();
         let slow = rooms.iter().filter(|one| {
             one.tenant == tenant
-                && one.since.elapsed() >= self.limits.grace
+                && one.age().is_some_and(|age| age >= self.limits.grace)
                 && !one.evicted.is_cancelled()
         });
         if let Some(slowest) = slow.min_by(|one, other| one.rate().total_cmp(&other.rate())) {
@@ -238,10 +239,20 @@ impl ResultBudget {
 }
 
 impl ReadProgress {
+    /// Records that the result is sent from now on.
+    pub(super) fn begin(&self) {
+        self.since.get_or_init(Instant::now);
+    }
+
+    /// The time for which it is sent. None before.
+    fn age(&self) -> Option<Duration> {
+        self.since.get().map(Instant::elapsed)
+    }
+
     /// The mean rate at which the client has read so far, bytes per second.
     fn rate(&self) -> f64 {
         let taken = self.bytes.load(Ordering::Relaxed) as f64;
-        taken / self.since.elapsed().as_secs_f64().max(1e-3)
+        taken / self.age().unwrap_or_default().as_secs_f64().max(1e-3)
     }
 
     /// Records that the client has read `bytes` bytes.
@@ -310,6 +321,11 @@ impl Encoded {
         &self.bytes
     }
 
+    /// The read progress.
+    pub(super) fn taking(&self) -> &Arc<ReadProgress> {
+        &self.taking
+    }
+
     /// A slice that shares the memory and the reservation.
     pub(super) fn slice(&self, range: std::ops::Range<usize>) -> Self {
         Self {
@@ -322,6 +338,7 @@ impl Encoded {
     /// releases all of its memory and ends with an error.
     pub(super) fn into_pieces(mut self) -> ReceiverStream<Result<Bytes, std::io::Error>> {
         let (pieces, stream) = mpsc::channel::<Result<Bytes, std::io::Error>>(1);
+        self.taking.begin();
         tokio::spawn(async move {
             while !self.bytes.is_empty() {
                 // A copy: a chunk in the connection's buffer must not keep the whole result alive.
@@ -402,6 +419,22 @@ mod tests {
         let lengths = rest.into_iter().map(|piece| piece.expect("no error").len());
         assert_eq!(lengths.sum::<usize>(), 400 * KIB - 5 * PIECE);
         drop(third);
+    }
+
+    #[tokio::test]
+    async fn an_answer_that_is_not_sent_yet_is_not_ended_for_another() {
+        let answers = answers(false, Duration::ZERO);
+        let a = tenant("a");
+        // It waits for its turn to be encoded, and is older than what is sent.
+        let waiting = answers.room(&a, 400 * KIB).await.expect("room");
+        let sent = answers.room(&a, 400 * KIB).await.expect("room");
+        let mut sent = sent.hold(vec![7; 400 * KIB]).into_pieces();
+        sent.next().await.expect("a piece").expect("no error");
+        let third = answers.room(&a, 400 * KIB).await.expect("room");
+        assert!(!waiting.taking().evicted.is_cancelled());
+        let rest: Vec<_> = sent.collect().await;
+        assert!(rest.last().is_some_and(Result::is_err), "it was ended");
+        drop((waiting, third));
     }
 
     #[tokio::test]

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 use super::admission::{Admission, AdmissionRequest, Durability};
@@ -31,6 +31,9 @@ const MAX_ARCHIVES: usize = 16;
 
 /// Maximum number of sweeps that are fetched by URI at a time.
 const MAX_FETCHES: usize = 32;
+
+/// Maximum number of reads of many rows of the queue at a time: as many as its engines read on for all others too.
+const MAX_SCANS: usize = 2;
 
 /// Maximum age of the last measurement of free disk space. When it is older, the disk is assumed to
 /// hang.
@@ -58,7 +61,9 @@ pub struct Service {
     /// while the client reads.
     pub(super) archives: Arc<TenantPermits>,
     /// Permit for reading and encoding one dense cloud at a time.
-    pub(super) clouds: Arc<Semaphore>,
+    pub(super) clouds: FairQueue,
+    /// Permits for reading many rows of the queue at once.
+    pub(super) scans: FairQueue,
     /// Permits for sweeps that are fetched by URI.
     pub(super) fetches: FairQueue,
     /// Whether the server is ready, as `/readyz` says. The gRPC health service follows it.
@@ -128,7 +133,8 @@ impl Service {
             compute: FairQueue::new(cores, cores),
             encoding: FairQueue::new(cores, cores),
             archives: Arc::new(TenantPermits::new(MAX_ARCHIVES, several)),
-            clouds: Arc::new(Semaphore::new(1)),
+            clouds: FairQueue::new(1, 1),
+            scans: FairQueue::new(MAX_SCANS, if several { 1 } else { MAX_SCANS }),
             fetches: FairQueue::new(
                 MAX_FETCHES,
                 if several {
@@ -288,22 +294,6 @@ impl Service {
         Ok(job)
     }
 
-    /// The forward pairs of a sequence in order. Empty for a pair.
-    ///
-    /// # Errors
-    /// [`ApiError::StoreUnavailable`], [`ApiError::DiskFull`] or [`ApiError::Draining`] if the
-    /// queue fails or is closed.
-    pub async fn pairs(&self, job: &Job) -> Result<Vec<Arc<Job>>, ApiError> {
-        match job.kind {
-            Kind::Pair => Ok(Vec::new()),
-            Kind::Sequence => {
-                let mut pairs = self.queue.pairs(job.id).await?;
-                pairs.retain(|pair| !pair.backward);
-                Ok(pairs)
-            }
-        }
-    }
-
     /// Cancels a job of the caller's tenant and returns it. A queued job ends at once. A running
     /// one ends after this call has returned, within a group of iterations of its fit or of
     /// clusters of its search. Of a sequence all pairs are cancelled. An ended job is not changed.
@@ -340,7 +330,8 @@ impl Service {
     /// new job.
     ///
     /// # Errors
-    /// - [`ApiError::Forbidden`] if the caller may only read.
+    /// - [`ApiError::Forbidden`] if the caller may only read, [`ApiError::Priority`] if it may not ask for the
+    ///   job's priority.
     /// - [`ApiError::NotFound`] if there is no such job, or another tenant owns it.
     /// - [`ApiError::BadRequest`] if the job has not ended, or has succeeded and still has its
     ///   result.
@@ -351,8 +342,12 @@ impl Service {
     pub async fn requeue(&self, caller: &Caller, id: JobId) -> Result<Arc<Job>, ApiError> {
         self.check_new_work(caller)?;
         let job = self.job(caller, id).await?;
-        let pairs = self.queue.pairs(id).await?;
-        let undone = pairs.iter().filter(|pair| pair.state != State::Succeeded);
+        caller.may_ask_for(job.priority)?;
+        let pairs = self.all_pairs(&job).await?;
+        // Those that the queue takes up again.
+        let undone = pairs
+            .iter()
+            .filter(|pair| pair.state != State::Succeeded || pair.is_cut_short());
         let of_pairs: f64 = undone.map(|pair| pair.cost_seconds).sum();
         let _reservation = self.admission.admit(&AdmissionRequest {
             tenant: &caller.tenant,

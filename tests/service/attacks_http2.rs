@@ -2,7 +2,10 @@
 
 use std::time::Duration;
 
+use tokio_stream::StreamExt;
+
 use crate::clouds::{form, medium_pair};
+use crate::grpc::{client, pair, proto};
 use crate::raw_http::{
     Besieged, CONTINUATION, DATA, END_HEADERS, END_STREAM, Frames, GOAWAY, HEADERS, MAX_GROWTH,
     PING, RST_STREAM, SETTINGS, WINDOW_UPDATE, field, frame, head,
@@ -218,15 +221,15 @@ async fn requests_that_are_refused_by_their_head_and_hang_up_keep_nothing_busy()
     assert!(siege.server.wait(PATIENCE).is_some(), "SIGTERM ends it");
 }
 
-/// A connection that asks for a result 60 times and reads none of the responses.
-fn asks_and_does_not_read(server: &Server, id: &str) -> Frames {
+/// A connection that asks for a path `times` times and reads none of the responses.
+fn asks_and_does_not_read(server: &Server, path: &str, times: u32) -> Frames {
     const INITIAL_WINDOW_SIZE: u16 = 4;
     let mut window = INITIAL_WINDOW_SIZE.to_be_bytes().to_vec();
     window.extend(0_u32.to_be_bytes());
     let frames = Frames::open(server);
     let mut bytes = frame(SETTINGS, 0, 0, &window);
-    for stream in streams(60) {
-        let mut block = head("GET", &format!("/v1/jobs/{id}/result"));
+    for stream in streams(times) {
+        let mut block = head("GET", path);
         block.extend(field("accept", "application/json"));
         bytes.extend(frame(HEADERS, END_HEADERS | END_STREAM, stream, &block));
     }
@@ -248,11 +251,12 @@ async fn answers_that_nobody_reads_are_bounded_and_given_up() {
     let job: serde_json::Value = sent.json().await.expect("a job");
     let id = job["id"].as_str().expect("a name").to_owned();
     assert_eq!(ended(&siege.server, &id).await["state"], "succeeded");
+    let result = format!("/v1/jobs/{id}/result");
     // The allocator may keep the budget of one attack. A leak of it by each of four would be seen.
     let mut kept = Vec::new();
     for _ in 0..4 {
         let answering: Vec<_> = (0..4)
-            .map(|_| asks_and_does_not_read(&siege.server, &id).answer_pings())
+            .map(|_| asks_and_does_not_read(&siege.server, &result, 60).answer_pings())
             .collect();
         // 240 responses of some megabytes each. Together they may use at most a tenth of that.
         let began = std::time::Instant::now();
@@ -266,13 +270,37 @@ async fn answers_that_nobody_reads_are_bounded_and_given_up() {
             connection.join().expect("no panic");
         }
         // Their memory is available again.
-        let url = siege.server.url(&format!("/v1/jobs/{id}/result"));
+        let url = siege.server.url(&result);
         let answer = client.get(url).send().await.expect("an answer");
         assert_eq!(answer.status(), 200);
         kept.push(siege.grown());
     }
     assert!(kept[3] < kept[0] + MAX_GROWTH, "{kept:?} bytes");
     siege.serves().await;
+}
+
+#[tokio::test]
+async fn pages_that_nobody_reads_take_no_room_of_the_results_of_others() {
+    let siege = Besieged::new("").await;
+    // As many as two connections may have; together they are larger than all responses may be.
+    let held: Vec<_> = ["/docs/swagger-ui-bundle.js", "/docs/swagger-ui.css"]
+        .map(|path| asks_and_does_not_read(&siege.server, path, 128))
+        .into();
+    std::thread::sleep(Duration::from_secs(1));
+    let options = proto::Options::default();
+    let mut calls = client(&siege.server).await;
+    let answer = calls.estimate_flow(pair(medium_pair(), options)).await;
+    let mut answer = answer.expect("an answer").into_inner();
+    let mut bytes = 0;
+    while let Some(message) = answer.next().await {
+        use proto::estimate_flow_response::Part;
+        if let Some(Part::Chunk(chunk)) = message.expect("no error").part {
+            bytes += chunk.flow.len();
+        }
+    }
+    assert!(bytes > 64 << 10, "{bytes}");
+    siege.has_not_grown();
+    drop(held);
 }
 
 #[tokio::test]

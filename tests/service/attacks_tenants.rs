@@ -9,6 +9,7 @@ use reqwest::Client;
 use serde_json::{Value, json};
 
 use crate::clouds::{file, form, small_pair};
+use crate::grpc::{client, proto};
 use crate::server::{Folder, PATIENCE, Server, ended};
 
 const WRITER: &str = "key-of-the-writer-of-a";
@@ -203,6 +204,11 @@ async fn readers_and_links_see_no_webhook_and_a_link_dies_with_the_key_that_made
         let seen = get(&server, key, &path).await;
         assert_eq!(seen["options"]["webhook"], Value::Null, "{seen}");
         assert_eq!(seen["options"]["labels"], labels);
+        let mut asked = tonic::Request::new(proto::GetJobRequest { id: id.clone() });
+        let shown = format!("Bearer {key}").parse().expect("plain text");
+        asked.metadata_mut().insert("authorization", shown);
+        let seen = client(&server).await.get_job(asked).await.expect("a job");
+        assert_eq!(seen.get_ref().labels.is_empty(), labels.is_null());
     }
     ended_for(&server, &path).await;
     let folder = server.kill();
@@ -213,6 +219,66 @@ async fn readers_and_links_see_no_webhook_and_a_link_dies_with_the_key_that_made
         .bearer_auth(token)
         .send();
     assert_eq!(answer.await.expect("an answer").status(), 401);
+}
+
+#[tokio::test]
+async fn a_key_that_may_not_ask_for_a_priority_may_not_queue_a_job_of_it_again() {
+    const LOW: &str = "key-of-the-low-writer-of-a";
+    let low = format!(
+        "[[keys]]\ntenant = \"a\"\nrole = \"write\"\nmax_priority = \"low\"\nkey = \"{LOW}\"\n"
+    );
+    let server = Server::with_config(&(config("") + &low));
+    let options = json!({
+        "priority": "high", "preset": "paper",
+        "field": { "max_iterations": 1_000_000, "patience": 1_000_000 },
+    });
+    let id = submit(&server, WRITER, &options).await;
+    let path = format!("/v1/jobs/{id}");
+    let cancelled = Client::new().delete(server.url(&path)).bearer_auth(LOW);
+    assert_eq!(cancelled.send().await.expect("an answer").status(), 200);
+    ended_for(&server, &path).await;
+    for (key, status) in [(LOW, 403), (WRITER, 200)] {
+        let again = Client::new().post(server.url(&format!("{path}/requeue")));
+        let answer = again.bearer_auth(key).send().await.expect("an answer");
+        assert_eq!(answer.status(), status, "{key}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn reading_long_sequences_holds_up_no_other_tenant() {
+    const SWEEPS: usize = 400;
+    const READS: usize = 200;
+    let server = Server::with_config(&config(""));
+    let sweep = file(fnsf::formats::CloudFormat::Pcd, &small_pair()[0][..300]);
+    let options =
+        r#"{"preset": "paper", "field": {"max_iterations": 1000000, "patience": 1000000}}"#;
+    let mut form = reqwest::multipart::Form::new().text("options", options);
+    for index in 0..SWEEPS {
+        let part = reqwest::multipart::Part::bytes(sweep.clone()).file_name(format!("{index}.pcd"));
+        form = form.part("sweep", part);
+    }
+    let sent = Client::new().post(server.url("/v1/sequences"));
+    let sent = sent.bearer_auth(WRITER).multipart(form).send();
+    let sequence: Value = sent.await.expect("an answer").json().await.expect("JSON");
+    let path = format!("/v1/jobs/{}", sequence["id"].as_str().expect("an id"));
+    let reads: Vec<_> = (0..READS)
+        .map(|_| {
+            Client::new()
+                .get(server.url(&path))
+                .bearer_auth(READER)
+                .send()
+        })
+        .map(tokio::spawn)
+        .collect();
+    let began = Instant::now();
+    get(&server, OTHER, "/v1/jobs").await;
+    let took = began.elapsed();
+    assert!(server.is_ready());
+    for read in reads {
+        let answer = read.await.expect("no panic").expect("an answer");
+        assert_eq!(answer.status(), 200);
+    }
+    assert!(took < Duration::from_secs(5), "{took:?}");
 }
 
 async fn ended_for(server: &Server, path: &str) {

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use prost::Message;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status, Streaming};
@@ -301,7 +302,7 @@ impl SceneFlow for Calls {
     ) -> Result<Response<proto::Job>, Status> {
         let call = Call::of(&request)?;
         let job = self.named(&call, &request.get_ref().id).await?;
-        let mut message = convert::job(&job);
+        let mut message = convert::job_for(&call.caller, &job);
         let pairs = self.service.pairs(&job).await?;
         message.pair_ids = pairs.iter().map(|pair| pair.id.to_string()).collect();
         message.wait = self.service.waiting(&job).await?.map(convert::wait);
@@ -375,7 +376,8 @@ impl SceneFlow for Calls {
         tokio::spawn(async move {
             loop {
                 let job = Arc::clone(&news.borrow_and_update());
-                let sent = answers.send(Ok(convert::job(&job))).await;
+                let shown = convert::job_for(&call.caller, &job);
+                let sent = answers.send(Ok(shown)).await;
                 if sent.is_err() || job.state.is_end() {
                     return;
                 }
@@ -399,8 +401,17 @@ impl SceneFlow for Calls {
         let call = Call::of(&request)?;
         let job = self.named(&call, &request.get_ref().id).await?;
         let SequenceTracks { tracks, .. } = self.service.tracks(&job).await?;
-        let messages = tracks.into_iter().map(|track| Ok(convert::track(&track)));
-        Ok(Response::new(Box::pin(tokio_stream::iter(messages))))
+        let messages: Vec<proto::Track> = tracks.iter().map(convert::track).collect();
+        let bytes = messages.iter().map(Message::encoded_len).sum();
+        let room = self.service.answers.room(&job.tenant, bytes).await?;
+        let (answers, stream) = mpsc::channel(AHEAD);
+        tokio::spawn(async move {
+            let sent = chunks::send(messages.into_iter(), &answers, room.taking()).await;
+            if let Err(error) = sent {
+                let _gone_is_fine = answers.try_send(Err(error.into()));
+            }
+        });
+        Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
     }
 
     async fn download_result(

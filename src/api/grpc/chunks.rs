@@ -164,6 +164,7 @@ pub(super) async fn send<M: Message>(
     answers: &mpsc::Sender<Result<M, Status>>,
     taking: &ReadProgress,
 ) -> Result<bool, ApiError> {
+    taking.begin();
     for message in messages {
         let length = message.encoded_len();
         tokio::select! {

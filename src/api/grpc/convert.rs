@@ -1,6 +1,7 @@
 //! Conversion of jobs, flows and dense clouds into messages.
 
 use super::proto;
+use crate::api::auth::Caller;
 use crate::api::error::ApiError;
 use crate::api::results::Answer;
 use crate::api::waiting::Waiting;
@@ -66,6 +67,16 @@ pub(super) fn job(job: &Job) -> proto::Job {
         delivery: job.delivery.as_ref().map(delivery),
         wait: None,
     }
+}
+
+/// Converts a job for its reader. With a share link it is shown without what is for its owner alone.
+pub(super) fn job_for(caller: &Caller, job: &Job) -> proto::Job {
+    let mut message = self::job(job);
+    if caller.shared_job.is_some() {
+        message.labels.clear();
+        message.delivery = None;
+    }
+    message
 }
 
 fn delivery(delivery: &Delivery) -> proto::Delivery {

@@ -1,18 +1,59 @@
 //! The gRPC routes: the calls, health checks and reflection.
 
 use std::sync::Arc;
+use std::time::Duration;
 
-use axum::Router;
+use axum::body::Body;
+use axum::extract::{Request, State};
+use axum::middleware::{Next, from_fn_with_state};
+use axum::response::Response;
+use axum::{BoxError, Router};
+use http_body_util::{BodyExt, LengthLimitError, Limited};
+use tonic::Status;
 use tonic::codec::CompressionEncoding;
 use tonic::server::NamedService;
 use tonic::service::Routes;
 use tonic_health::ServingStatus;
 
 use super::{calls, proto};
+use crate::api::error::ApiError;
+use crate::api::listener::bodies::{NotInTime, RequestBody, TimedBody};
 use crate::api::service::Service;
 
 /// Maximum size of an incoming message, bytes: a chunk of 1 MiB and its envelope.
 const MAX_MESSAGE: usize = (1 << 20) + (64 << 10);
+
+/// Maximum size of the body of a call that takes no clouds, bytes.
+const MAX_SMALL_BODY: usize = 128 << 10;
+
+/// Maximum size of a message to the health service, bytes.
+const MAX_HEALTH_MESSAGE: usize = 4 << 10;
+
+/// Bounds the body of a call that takes no clouds in size and in time: an incomplete message is in no memory budget.
+async fn with_small_body(State(most): State<Duration>, request: Request, next: Next) -> Response {
+    let path = request.uri().path();
+    let takes_clouds = ["/EstimateFlow", "/EstimateSequence", "/SubmitJob"];
+    if takes_clouds.iter().any(|call| path.ends_with(call)) {
+        return next.run(request).await;
+    }
+    let request = request.map(|body| {
+        let body = TimedBody::new(Limited::new(body, MAX_SMALL_BODY), most);
+        Body::new(RequestBody::new(body).map_err(status))
+    });
+    next.run(request).await
+}
+
+/// The status of a call whose body ends with an error.
+fn status(error: BoxError) -> BoxError {
+    let refused = if error.is::<LengthLimitError>() {
+        ApiError::TooLarge("the request is larger than 128 KiB".to_owned())
+    } else if error.is::<NotInTime>() {
+        ApiError::TooSlow
+    } else {
+        return error;
+    };
+    Status::from(refused).into()
+}
 
 /// The gRPC routes. The health status follows [`Service::set_ready`].
 pub(crate) fn router(service: &Arc<Service>) -> Router {
@@ -39,6 +80,7 @@ pub(crate) fn router(service: &Arc<Service>) -> Router {
         }
     });
     let mut routes = Routes::builder();
+    let health = health.max_decoding_message_size(MAX_HEALTH_MESSAGE);
     routes.add_service(calls).add_service(health);
     for version in [1, 0] {
         let reflection = tonic_reflection::server::Builder::configure()
@@ -51,5 +93,7 @@ pub(crate) fn router(service: &Arc<Service>) -> Router {
             routes.add_service(older.expect("the descriptors are our own"));
         }
     }
-    routes.routes().into_axum_router()
+    let most = service.limits.body_idle;
+    let small = from_fn_with_state(most, with_small_body);
+    routes.routes().into_axum_router().layer(small)
 }

@@ -230,13 +230,22 @@ impl Reader {
     /// Submits the next pair with the sweeps of its window. It waits for a client that has to read the
     /// pairs before, until other requests need the memory of the sweeps.
     async fn submit_next(&mut self) -> Result<(), ApiError> {
-        let index = self.index;
-        self.index += 1;
         let place = self.pending.clone().reserve_owned();
         let place = match self.held.back() {
-            Some(latest) => latest.room.pause(self.held_bytes(), place).await?,
-            None => place.await,
+            Some(latest) => latest.room.pause(self.held_bytes(), place).await,
+            None => Ok(place.await),
         };
+        let place = match place {
+            Ok(place) => place,
+            // The sweeps go, so that their memory is there for others. No later pair is submitted.
+            Err(error) => {
+                self.held.clear();
+                self.count = self.index;
+                return Err(error);
+            }
+        };
+        let index = self.index;
+        self.index += 1;
         let Ok(place_in_line) = place else {
             return Ok(());
         };

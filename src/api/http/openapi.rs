@@ -3,17 +3,23 @@
 use std::sync::Arc;
 
 use axum::Router;
+use axum::http::header;
+use axum::middleware::map_response;
+use axum::response::Response;
+use axum::routing::get;
+use bytes::Bytes;
 use utoipa::openapi::header::HeaderBuilder;
 use utoipa::openapi::path::Operation;
 use utoipa::openapi::schema::{KnownFormat, Object, SchemaFormat, Type};
 use utoipa::openapi::security::{Http, HttpAuthScheme, SecurityScheme};
 use utoipa::openapi::{Content, RefOr, Schema};
 use utoipa::{Modify, OpenApi};
-use utoipa_swagger_ui::SwaggerUi;
+use utoipa_swagger_ui::{Config, SwaggerUi};
 
 use super::results::{ARCHIVE, RESULT_HEADERS};
 use super::{events, handlers, info, list, queue, results, scene, share, street};
 use crate::api::codec::ANSWER_FORMATS;
+use crate::api::listener::HasRoom;
 use crate::api::service::Service;
 use crate::formats::DENSE_FORMATS;
 
@@ -135,9 +141,20 @@ fn describe(
 )]
 struct Contract;
 
-/// The routes `/openapi.json` and `/docs`.
+/// The routes `/openapi.json` and `/docs`. They need no key. All their answers share the same bytes, so that one
+/// which nobody reads costs nothing.
 pub(super) fn router() -> Router<Arc<Service>> {
-    SwaggerUi::new("/docs")
-        .url("/openapi.json", Contract::openapi())
-        .into()
+    let document = Contract::openapi().to_json();
+    let document = Bytes::from(document.expect("the document is our own"));
+    let answer =
+        get(move || async move { ([(header::CONTENT_TYPE, "application/json")], document) });
+    let pages = SwaggerUi::new("/docs").config(Config::from("/openapi.json"));
+    Router::from(pages)
+        .route("/openapi.json", answer)
+        .layer(map_response(shared))
+}
+
+async fn shared(mut response: Response) -> Response {
+    response.extensions_mut().insert(HasRoom);
+    response
 }

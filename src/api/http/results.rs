@@ -1,7 +1,7 @@
 //! Responses with results: content negotiation, range requests, entity tags, and zip archives of
 //! sequences.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use axum::body::{Body, Bytes};
@@ -17,10 +17,11 @@ use crate::api::codec::AnswerFormat;
 use crate::api::dense;
 use crate::api::error::ApiError;
 use crate::api::listener::HasRoom;
-use crate::api::result_budget::Encoded;
+use crate::api::result_budget::{Encoded, ReadProgress};
 use crate::api::service::Service;
 use crate::formats::DenseFormat;
 use crate::job::{DenseReport, Job, Kind, State as JobState};
+use crate::sync::locked;
 
 /// The media type of the archive with the flows of a sequence.
 pub(super) const ARCHIVE: &str = "application/zip";
@@ -331,9 +332,11 @@ async fn archive(
     let runtime = tokio::runtime::Handle::current();
     tokio::task::spawn_blocking(move || {
         let _turn = turn;
+        let taking = Arc::new(Mutex::new(None));
         let pipe = Pipe {
             pieces: pieces.clone(),
             runtime: runtime.clone(),
+            taking: Arc::clone(&taking),
         };
         let mut zip = zip::ZipWriter::new_stream(pipe);
         let plain = zip::write::SimpleFileOptions::default()
@@ -341,8 +344,11 @@ async fn archive(
         let mut write = || -> Result<(), Box<dyn std::error::Error>> {
             for pair in &pairs {
                 let encoded = runtime.block_on(service.encoded(pair, format))?;
+                encoded.taking().begin();
+                *locked(&taking) = Some(Arc::clone(encoded.taking()));
                 zip.start_file(format!("{:06}.{}", pair.index, format.ending()), plain)?;
                 std::io::Write::write_all(&mut zip, encoded.bytes())?;
+                *locked(&taking) = None;
             }
             Ok(())
         };
@@ -364,11 +370,13 @@ async fn archive(
     Ok(response)
 }
 
-/// A writer into a response body. It blocks while the client reads slowly, and fails if the client
-/// disconnects or does not read for an hour.
+/// A writer into a response body. It blocks while the client reads slowly. It fails if the client disconnects or
+/// does not read for an hour, and if another result needs the memory of the flow that is sent.
 struct Pipe {
     pieces: tokio::sync::mpsc::Sender<Result<Bytes, std::io::Error>>,
     runtime: tokio::runtime::Handle,
+    /// The read progress of the flow that is sent.
+    taking: Arc<Mutex<Option<Arc<ReadProgress>>>>,
 }
 
 impl std::io::Write for Pipe {
@@ -378,12 +386,27 @@ impl std::io::Write for Pipe {
         const PIECE: usize = 64 << 10;
         let length = bytes.len().min(PIECE);
         let piece = Bytes::copy_from_slice(&bytes[..length]);
-        let sending = async { tokio::time::timeout(PATIENCE, self.pieces.send(Ok(piece))).await };
-        match self.runtime.block_on(sending) {
-            Ok(Ok(())) => Ok(length),
-            Ok(Err(_)) => Err(std::io::ErrorKind::BrokenPipe.into()),
-            Err(_) => Err(std::io::ErrorKind::TimedOut.into()),
+        let taking = locked(&self.taking).clone();
+        let evicted = async {
+            match &taking {
+                Some(taking) => taking.evicted().await,
+                None => std::future::pending().await,
+            }
+        };
+        let sending = async {
+            tokio::select! {
+                sent = self.pieces.send(Ok(piece)) => {
+                    sent.map_err(|_| std::io::Error::from(std::io::ErrorKind::BrokenPipe))
+                }
+                () = evicted => Err(std::io::ErrorKind::TimedOut.into()),
+                () = tokio::time::sleep(PATIENCE) => Err(std::io::ErrorKind::TimedOut.into()),
+            }
+        };
+        self.runtime.block_on(sending)?;
+        if let Some(taking) = &taking {
+            taking.took(length);
         }
+        Ok(length)
     }
 
     fn flush(&mut self) -> std::io::Result<()> {

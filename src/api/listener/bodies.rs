@@ -4,7 +4,7 @@
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll, ready};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use axum::BoxError;
 use axum::body::Body as AnyBody;
@@ -12,6 +12,7 @@ use bytes::Bytes;
 use hyper::body::{Body, Frame, SizeHint};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::task::coop::poll_proceed;
+use tokio::time::{Sleep, sleep};
 
 use super::connections::OpenRequest;
 
@@ -53,6 +54,51 @@ impl<B: Body<Data = Bytes> + Unpin> Body for RequestBody<B> {
 
     fn is_end_stream(&self) -> bool {
         self.ended || self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
+    }
+}
+
+/// The error of a body that has not come in time.
+#[derive(Debug, thiserror::Error)]
+#[error("the request did not come in time")]
+pub(in crate::api) struct NotInTime;
+
+/// A request body that has to come in time, or it ends with [`NotInTime`].
+pub(in crate::api) struct TimedBody<B> {
+    body: B,
+    end: Pin<Box<Sleep>>,
+}
+
+impl<B> TimedBody<B> {
+    /// `most` is the time for the whole body, from now on.
+    pub(in crate::api) fn new(body: B, most: Duration) -> Self {
+        Self {
+            body,
+            end: Box::pin(sleep(most)),
+        }
+    }
+}
+
+impl<B: Body<Data = Bytes, Error: Into<BoxError>> + Unpin> Body for TimedBody<B> {
+    type Data = Bytes;
+    type Error = BoxError;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, BoxError>>> {
+        if self.end.as_mut().poll(context).is_ready() {
+            return Poll::Ready(Some(Err(NotInTime.into())));
+        }
+        let frame = ready!(Pin::new(&mut self.body).poll_frame(context));
+        Poll::Ready(frame.map(|frame| frame.map_err(Into::into)))
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
     }
 
     fn size_hint(&self) -> SizeHint {
@@ -155,7 +201,6 @@ impl Body for AnswerBody {
 #[cfg(test)]
 mod tests {
     use std::convert::Infallible;
-    use std::time::Duration;
 
     use http_body_util::BodyExt;
     use tokio::time::timeout;

@@ -1,14 +1,14 @@
 //! The engine on one SQLite file.
 
+use std::fmt;
 use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use async_trait::async_trait;
 use rusqlite::Connection;
-use tokio::sync::{mpsc, watch};
+use tokio::sync::{Semaphore, mpsc, watch};
 
 use super::files::{Files, RUNNING, STOPPED, run_mark};
 use super::heartbeat::SqliteHeartbeat;
@@ -60,8 +60,9 @@ pub fn open_sqlite(
 /// One SQLite file. One thread writes, and reads run concurrently.
 pub(super) struct SqliteEngine {
     writer: Writer,
-    readers: [Arc<Mutex<Connection>>; READERS],
-    next_reader: AtomicU64,
+    readers: Arc<[Mutex<Connection>; READERS]>,
+    /// A permit for each reader, so that no thread waits for one.
+    turns: Arc<Semaphore>,
     local: Arc<Local>,
     options: QueueOptions,
     identity: i32,
@@ -89,10 +90,10 @@ impl SqliteEngine {
         recover(&connection, options, &local, || {
             run_mark(folder, STOPPED, RUNNING)
         })?;
-        let open_reader = || schema::open_reader(&path).map(|reader| Arc::new(Mutex::new(reader)));
+        let open_reader = || schema::open_reader(&path).map(Mutex::new);
         Ok(Self {
-            readers: [open_reader()?, open_reader()?],
-            next_reader: AtomicU64::new(0),
+            readers: Arc::new([open_reader()?, open_reader()?]),
+            turns: Arc::new(Semaphore::new(READERS)),
             writer: Writer::start(connection, options.clone(), Arc::clone(&local))?,
             local,
             options: options.clone(),
@@ -196,11 +197,17 @@ impl Engine for SqliteEngine {
         T: Send + 'static,
         C: Fn(&dyn Sql) -> Result<T, QueueError> + Send + 'static,
     {
-        let turn = self.next_reader.fetch_add(1, Ordering::Relaxed) as usize % READERS;
-        let reader = Arc::clone(&self.readers[turn]);
-        let read = tokio::task::spawn_blocking(move || query(&SqliteSql(&locked(&reader))));
-        read.await
-            .map_err(|error| QueueError::Store(error.to_string()))?
+        let store = |error: &dyn fmt::Display| QueueError::Store(error.to_string());
+        let turn = Arc::clone(&self.turns).acquire_owned().await;
+        let turn = turn.map_err(|error| store(&error))?;
+        let readers = Arc::clone(&self.readers);
+        let read = tokio::task::spawn_blocking(move || {
+            let _turn = turn;
+            let free = readers.iter().find_map(|reader| reader.try_lock().ok());
+            let reader = free.unwrap_or_else(|| locked(&readers[0]));
+            query(&SqliteSql(&reader))
+        });
+        read.await.map_err(|error| store(&error))?
     }
 
     async fn watch(&self, id: JobId) -> Result<watch::Receiver<Arc<Job>>, QueueError> {
