@@ -12,6 +12,7 @@ Needs the Python package `fnsf` (`clients/python`), `small_gicp` and `kiss-icp`.
 import argparse
 import os
 import time
+from functools import partial
 from pathlib import Path
 from statistics import median
 
@@ -31,8 +32,7 @@ os.environ["OMP_NUM_THREADS"] = str(ARGUMENTS.threads)
 import fnsf  # noqa: E402
 import numpy as np  # noqa: E402
 import small_gicp  # noqa: E402
-from kiss_icp.config import KISSConfig  # noqa: E402
-from kiss_icp.kiss_icp import KissICP  # noqa: E402
+from odometry import by_kiss_icp  # noqa: E402
 
 
 def by_fnsf(source: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -52,19 +52,11 @@ def by_small_gicp(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     return found.T_target_source
 
 
-def by_kiss_icp(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """The odometry from the target as the first sweep to the source as the second."""
-    config = KISSConfig()
-    config.registration.max_num_threads = ARGUMENTS.threads
-    config.mapping.voxel_size = config.data.max_range / 100.0
-    config.data.deskew = False
-    odometry = KissICP(config)
-    for sweep in (target, source):
-        odometry.register_frame(sweep, np.zeros(len(sweep)))
-    return odometry.last_pose
-
-
-PROGRAMS = {"fnsf": by_fnsf, "small_gicp": by_small_gicp, "KISS-ICP": by_kiss_icp}
+PROGRAMS = {
+    "fnsf": by_fnsf,
+    "small_gicp": by_small_gicp,
+    "KISS-ICP": partial(by_kiss_icp, threads=ARGUMENTS.threads),
+}
 
 
 def error(found: np.ndarray, truth: np.ndarray, sweep: np.ndarray) -> tuple[float, float, float]:

@@ -38,8 +38,7 @@ os.environ[THREADS] = str(ARGUMENTS.threads)
 
 import hdbscan  # noqa: E402
 import numpy as np  # noqa: E402
-from kiss_icp.config import KISSConfig  # noqa: E402
-from kiss_icp.kiss_icp import KissICP  # noqa: E402
+from odometry import by_kiss_icp  # noqa: E402
 from scipy.ndimage import maximum_filter  # noqa: E402
 from scipy.spatial import cKDTree  # noqa: E402
 
@@ -77,18 +76,6 @@ class Cloud:
 
 def transformed(motion: Array, points: Array) -> Array:
     return points @ motion[:3, :3].T + motion[:3, 3]
-
-
-def ego_motion(source: Array, target: Array) -> Array:
-    """By KISS-ICP with its defaults, target_from_source."""
-    config = KISSConfig()
-    config.registration.max_num_threads = ARGUMENTS.threads
-    config.mapping.voxel_size = config.data.max_range / 100.0
-    config.data.deskew = False
-    odometry = KissICP(config)
-    for sweep in (target, source):
-        odometry.register_frame(sweep, np.zeros(len(sweep)))
-    return odometry.last_pose
 
 
 def clusters(source: Array, target: Array) -> tuple[Array, Array]:
@@ -244,7 +231,7 @@ def run_peer(path: Path, given: bool, folder: Path, seed: int) -> dict[str, floa
         off = [~pair[name] for name in ("ground1", "ground2")]
         ego = pair["ego_SE3"].astype(np.float64)
     began = time.perf_counter()
-    ego = ego if given else ego_motion(*whole)
+    ego = ego if given else by_kiss_icp(*whole, ARGUMENTS.threads)
     aligned = time.perf_counter() - began
     flow = transformed(ego, whole[0]) - whole[0]
     flow[off[0]], seconds = icp_flow(whole[0][off[0]], whole[1][off[1]], ego, seed)
