@@ -7,6 +7,7 @@ use tokio_stream::StreamExt;
 use tonic::transport::Endpoint;
 
 use crate::clouds::form;
+use crate::grpc::proto::estimate_sequence_request::{Begin, Part, Sweep};
 use crate::grpc::proto::scene_flow_client::SceneFlowClient;
 use crate::grpc::{chunk, proto};
 use crate::server::{PATIENCE, Server};
@@ -14,9 +15,32 @@ use crate::server::{PATIENCE, Server};
 /// Time for which the client reads nothing: several times the retention of results.
 const PAUSE: Duration = Duration::from_secs(5);
 
+/// Starts a call with the first sweeps of a street. No flow fits into the windows of its connection.
+async fn estimate(
+    server: &Server,
+    begin: Begin,
+    street: &Street,
+    sweeps: usize,
+) -> tonic::Streaming<proto::EstimateSequenceResponse> {
+    let mut parts = vec![Part::Begin(begin)];
+    for index in 0..sweeps {
+        let sweep = street.sweep(index).expect("a sweep");
+        parts.push(Part::Sweep(Sweep::default()));
+        parts.push(Part::Chunk(chunk(&sweep.points)));
+    }
+    let message = |part| proto::EstimateSequenceRequest { part: Some(part) };
+    let stream = tokio_stream::iter(parts.into_iter().map(message));
+    let endpoint = Endpoint::from_shared(server.url("")).expect("a good address");
+    let endpoint = endpoint
+        .initial_stream_window_size(65_535)
+        .initial_connection_window_size(65_535);
+    let mut calls = SceneFlowClient::new(endpoint.connect().await.expect("a connection"));
+    let answer = calls.estimate_sequence(stream).await.expect("an answer");
+    answer.into_inner()
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_pairs_of_a_stream_are_there_however_slowly_its_client_reads() {
-    use proto::estimate_sequence_request::{Begin, Part, Sweep};
     use proto::estimate_sequence_response::{Part as Answer, pair::Outcome};
     let server = Server::with_config("[queue]\nsync_result_retention_seconds = 1\n");
     let street = Street::new(&StreetOptions {
@@ -26,22 +50,7 @@ async fn the_pairs_of_a_stream_are_there_however_slowly_its_client_reads() {
         ..StreetOptions::default()
     });
     let street = street.expect("a street");
-    let mut parts = vec![Part::Begin(Begin::default())];
-    for index in 0..7 {
-        let sweep = street.sweep(index).expect("a sweep");
-        parts.push(Part::Sweep(Sweep::default()));
-        parts.push(Part::Chunk(chunk(&sweep.points)));
-    }
-    let message = |part| proto::EstimateSequenceRequest { part: Some(part) };
-    let stream = tokio_stream::iter(parts.into_iter().map(message));
-    // No flow fits into the windows of the connection.
-    let endpoint = Endpoint::from_shared(server.url("")).expect("a good address");
-    let endpoint = endpoint
-        .initial_stream_window_size(65_535)
-        .initial_connection_window_size(65_535);
-    let mut calls = SceneFlowClient::new(endpoint.connect().await.expect("a connection"));
-    let answer = calls.estimate_sequence(stream).await.expect("an answer");
-    let mut answer = answer.into_inner();
+    let mut answer = estimate(&server, Begin::default(), &street, 7).await;
     let mut pairs = 0;
     while let Some(message) = answer.next().await {
         if let Answer::Pair(pair) = message.expect("a message").part.expect("a part") {
@@ -61,7 +70,6 @@ async fn the_pairs_of_a_stream_are_there_however_slowly_its_client_reads() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_stream_whose_memory_others_need_leaves_no_pair_out_before_its_end() {
-    use proto::estimate_sequence_request::{Begin, Part, Sweep};
     use proto::estimate_sequence_response::Part as Answer;
     const SWEEPS: usize = 24;
     let limits = "max_upload_mib = 1\nmax_total_upload_mib = 2\nbody_timeout_seconds = 1\n\
@@ -78,23 +86,10 @@ async fn a_stream_whose_memory_others_need_leaves_no_pair_out_before_its_end() {
         preset: proto::Preset::Label.into(),
         ..proto::Options::default()
     };
-    let mut parts = vec![Part::Begin(Begin {
+    let begin = Begin {
         options: Some(Box::new(options)),
-    })];
-    for index in 0..SWEEPS {
-        let sweep = street.sweep(index).expect("a sweep");
-        parts.push(Part::Sweep(Sweep::default()));
-        parts.push(Part::Chunk(chunk(&sweep.points)));
-    }
-    let message = |part| proto::EstimateSequenceRequest { part: Some(part) };
-    let stream = tokio_stream::iter(parts.into_iter().map(message));
-    let endpoint = Endpoint::from_shared(server.url("")).expect("a good address");
-    let endpoint = endpoint
-        .initial_stream_window_size(65_535)
-        .initial_connection_window_size(65_535);
-    let mut calls = SceneFlowClient::new(endpoint.connect().await.expect("a connection"));
-    let answer = calls.estimate_sequence(stream).await.expect("an answer");
-    let mut answer = answer.into_inner();
+    };
+    let mut answer = estimate(&server, begin, &street, SWEEPS).await;
     // While nothing is read, another upload needs the memory of the sweeps that are held.
     let sweep = street.sweep(0).expect("a sweep").points;
     let large = [sweep.repeat(2), sweep.repeat(2)];

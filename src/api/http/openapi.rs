@@ -141,8 +141,8 @@ fn describe(
 )]
 struct Contract;
 
-/// The routes `/openapi.json` and `/docs`. They need no key. All their answers share the same bytes, so that one
-/// which nobody reads costs nothing.
+/// The routes `/openapi.json` and `/docs`. They need no key. All answers share the same bytes: an unread answer takes
+/// no memory of its own.
 pub(super) fn router() -> Router<Arc<Service>> {
     let document = Contract::openapi().to_json();
     let document = Bytes::from(document.expect("the document is our own"));
