@@ -367,7 +367,7 @@ pub(super) struct Output {
 }
 
 impl Output {
-    /// Begins to write a file, as [`write`] does.
+    /// Begins to write a file, as [`write()`] does.
     pub(super) fn create(path: &Path) -> anyhow::Result<Self> {
         let place = place_of(path).context("its folder is not there")?;
         if place.is_file() || !place.exists() {
