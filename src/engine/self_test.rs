@@ -6,7 +6,7 @@ use std::sync::Arc;
 use super::panics::message;
 use super::types::{DeviceFactory, Opened};
 use crate::flow::cpu::CpuBackend;
-use crate::flow::field::{Backend, BackendError};
+use crate::flow::field::Backend;
 use crate::flow::{self, Ego, FlowError, Point, Preset, Problem, Uncontrolled, largest};
 
 /// Translation of the scene (a wall and a post in front of it) between source and target, metres.
@@ -42,12 +42,7 @@ impl SelfTestError {
     /// Whether the self-test only lacked memory beside other pairs. This is no evidence against the
     /// device.
     pub(super) fn is_out_of_memory(&self) -> bool {
-        matches!(
-            self,
-            Self::Failed(FlowError::Backend(
-                BackendError::Busy | BackendError::Memory { .. }
-            ))
-        )
+        matches!(self, Self::Failed(FlowError::Backend(error)) if error.is_out_of_memory())
     }
 }
 

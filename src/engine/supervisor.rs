@@ -1,8 +1,8 @@
 //! Supervisor of a device, shared by all its lanes: opens it, runs the self-test, counts losses,
 //! reopens it with exponential back-off, and gives up in the end.
 //!
-//! The first lane that needs the device opens it; the others wait. Independent of the tasks that
-//! the lanes run.
+//! The first lane that needs the device opens it; the others look again every 100 ms whether it is
+//! open and whether they still have work. Independent of the tasks that the lanes run.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -28,6 +28,9 @@ pub(super) enum SelfTest {
     Shaken,
 }
 
+/// Interval at which a lane looks whether the device is open.
+const POLL_INTERVAL: Duration = Duration::from_millis(100);
+
 const WHILE_IDLE: &str = "it went away while it had nothing to do";
 
 /// A lane's share of the open device, for one task.
@@ -45,12 +48,16 @@ pub(super) struct DeviceSupervisor {
     reopening: ReopenPolicy,
     metrics: Arc<Metrics>,
     tell: watch::Sender<Health>,
-    /// Whether the device was ever open. Outside `state`, which stays locked during an opening.
+    /// Whether the device was ever open. Outside `state`, whose holders tell of the health: who reads
+    /// the health may ask for it.
     worked: AtomicBool,
+    /// Never locked for long: an opening, which may take minutes, is done without the lock.
     state: Mutex<State>,
 }
 
 struct State {
+    /// Whether a lane is opening the device.
+    opening: bool,
     opened: Option<Arc<dyn Opened>>,
     /// The lost device. It is destroyed before the next opening.
     lost: Option<Arc<dyn Opened>>,
@@ -78,6 +85,7 @@ impl DeviceSupervisor {
             tell,
             worked: AtomicBool::new(false),
             state: Mutex::new(State {
+                opening: false,
                 opened: None,
                 lost: None,
                 openings: 0,
@@ -120,11 +128,8 @@ impl DeviceSupervisor {
 
     /// Whether the device is lost and no lane has reported it yet.
     pub(super) fn is_lost_unreported(&self) -> bool {
-        match self.state.try_lock() {
-            Ok(state) => state.opened.as_ref().is_some_and(|opened| opened.is_lost()),
-            // It is being opened.
-            Err(_) => false,
-        }
+        let state = self.state();
+        state.opened.as_ref().is_some_and(|opened| opened.is_lost())
     }
 
     /// A lane's share of the device, if it is open.
@@ -149,7 +154,6 @@ impl DeviceSupervisor {
     /// A self-test that finds no memory beside the pairs of other lanes proves no fault, and losing
     /// the device would fail those pairs. In this case the device stays open.
     pub(super) fn open(&self, trust: SelfTest, ended: &mut dyn FnMut() -> bool) -> bool {
-        const POLL_INTERVAL: Duration = Duration::from_millis(100);
         if trust == SelfTest::Shaken
             && let Some(handle) = self.share()
             && let Err(error) = self_test::run(handle.backend.as_ref())
@@ -166,7 +170,8 @@ impl DeviceSupervisor {
         }
     }
 
-    /// Opens the device if it is not open. The error is the time until the next try.
+    /// Opens the device if it is not open and no other lane opens it. The error is the time until the
+    /// next look.
     fn opened(&self) -> Result<(), Duration> {
         let mut state = self.state();
         let now = Instant::now();
@@ -175,13 +180,24 @@ impl DeviceSupervisor {
             Some(_) => return Ok(()),
             None => {}
         }
+        if state.opening {
+            return Err(POLL_INTERVAL);
+        }
         if now < state.next_try {
             return Err(state.next_try - now);
         }
-        if let Some(lost) = state.lost.take() {
+        state.opening = true;
+        let lost = state.lost.take();
+        drop(state);
+        if let Some(lost) = lost {
             self.give_up(lost);
         }
-        let reason = match self.opened_and_tried() {
+        // With a panic no other lane would ever open the device.
+        let tried = catch_unwind(AssertUnwindSafe(|| self.opened_and_tried()));
+        let tried = tried.unwrap_or_else(|panic| Err(message(panic.as_ref())));
+        let mut state = self.state();
+        state.opening = false;
+        let reason = match tried {
             Ok(opened) => {
                 state.opened = Some(opened);
                 state.openings += 1;

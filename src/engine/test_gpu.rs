@@ -21,6 +21,8 @@ const TRIAL_POINTS: usize = 4800;
 pub(crate) struct Switches {
     /// Openings so far.
     pub(crate) openings: AtomicU32,
+    /// While set, an opening does not end.
+    pub(crate) opening_waits: AtomicBool,
     /// The next openings that fail, as a count.
     pub(crate) refusals: AtomicU32,
     /// The next pairs that panic, as a count.
@@ -102,6 +104,9 @@ impl Switches {
                 return Err(BackendError::NoDevice("the driver is away".to_owned()));
             }
             switches.openings.fetch_add(1, Ordering::Relaxed);
+            while switches.opening_waits.load(Ordering::Relaxed) {
+                thread::sleep(Duration::from_millis(1));
+            }
             let lost = Arc::new(AtomicBool::new(false));
             *switches.lost.lock().expect("no panic holds it") = Arc::clone(&lost);
             let switches = Arc::clone(&switches);

@@ -40,8 +40,8 @@ impl Stand {
         reached.expect("in time").expect("threads live");
     }
 
-    /// Polls as the server's housekeeping does. A poll while a lane holds the supervisor's lock has
-    /// no effect, so it is repeated.
+    /// Polls as the server's housekeeping does. A lane that is told to look may still be at work, so
+    /// it is repeated.
     async fn looked_at_until(&self, wanted: impl Fn(&Health) -> bool) {
         let looks = async {
             loop {
@@ -252,6 +252,31 @@ async fn a_pair_that_comes_while_the_device_is_away_is_given_back() {
         matches!(given_back, Err(EngineError::Broken(_))),
         "{given_back:?}"
     );
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_pair_that_comes_while_another_lane_opens_the_device_is_given_back_at_once() {
+    let stand = stand(2);
+    stand.ready().await;
+    stand.switches.opening_waits.store(true, Ordering::Relaxed);
+    stand.switches.destroy();
+    let is_opening = async {
+        while stand.switches.openings.load(Ordering::Relaxed) < 2 {
+            stand.device.look();
+            tokio::time::sleep(Duration::from_millis(2)).await;
+        }
+    };
+    timeout(PATIENCE, is_opening).await.expect("in time");
+    // The first lane was told to look, so it opens the device.
+    let lane = stand.device.lanes().nth(1).expect("a second lane");
+    let given_back = solved(&lane).await;
+    assert!(
+        matches!(given_back, Err(EngineError::Broken(_))),
+        "{given_back:?}"
+    );
+    stand.switches.opening_waits.store(false, Ordering::Relaxed);
+    stand.ready().await;
+    solved(&lane).await.expect("it works again");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -2,7 +2,7 @@
 //!
 //! All sums are taken in an order that does not depend on the number of threads.
 
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use rayon::prelude::*;
 
@@ -98,6 +98,8 @@ pub(super) struct Linear {
     between: Vec<f32>,
     variation: Variation,
     points: PlacedPoints,
+    /// The field of the result, if it was computed since the last update.
+    decoded: OnceLock<LinearField>,
 }
 
 /// The points of a batch on the grid.
@@ -120,6 +122,7 @@ impl Linear {
             between: vec![0.0; floats],
             variation: Variation::new(floats),
             points: PlacedPoints::default(),
+            decoded: OnceLock::new(),
         }
     }
 
@@ -178,6 +181,7 @@ impl Model for Linear {
     }
 
     fn update(&mut self, parameters: &Parameters) {
+        self.decoded = OnceLock::new();
         let weights = &parameters.as_slice()[..self.values.len()];
         self.encoder
             .apply(weights, &mut self.values, &mut self.between);
@@ -259,15 +263,20 @@ impl Model for Linear {
         points: &[Point],
         _: &WorkingSets<Self::WorkingSet>,
     ) -> Vec<Point> {
-        self.field(parameters).flow(points, &self.encoder.threads)
+        self.decoded(parameters).flow(points, &self.encoder.threads)
     }
 
     fn fitted(&self, parameters: &Parameters) -> FittedField {
-        FittedField::Linear(self.field(parameters))
+        FittedField::Linear(self.decoded(parameters).clone())
     }
 }
 
 impl Linear {
+    /// The field of the result, whose parameters are `parameters`.
+    fn decoded(&self, parameters: &Parameters) -> &LinearField {
+        self.decoded.get_or_init(|| self.field(parameters))
+    }
+
     /// The field with `parameters`.
     fn field(&self, parameters: &Parameters) -> LinearField {
         let mut values = vec![0.0; self.values.len()];

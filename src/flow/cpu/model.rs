@@ -23,7 +23,7 @@ pub(super) trait Model: Send + Sync {
     fn working_set(&self) -> Self::WorkingSet;
 
     /// Updates what the model derives from its parameters. Called before the first iteration and
-    /// after every change of `parameters`.
+    /// after every change of `parameters` or of those of the result.
     fn update(&mut self, parameters: &Parameters);
 
     /// Prepares the points of the following iterations. Called before the first iteration, and
@@ -69,7 +69,8 @@ pub(super) trait Model: Send + Sync {
     /// those of the regularization.
     fn gradient(&mut self, chunks: &[Self::ChunkGradients], gradients: &mut Parameters);
 
-    /// The field with `parameters`, which may be others than those of the last [`Self::update`].
+    /// The field with `parameters`: those of the result at the last [`Self::update`], which may be
+    /// others than those of that call.
     fn fitted(&self, parameters: &Parameters) -> FittedField;
 
     /// The flow of that field at any N `points`, N x 3 displacements in metres.

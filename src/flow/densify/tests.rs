@@ -120,6 +120,21 @@ fn the_static_world_lands_where_the_vehicle_sees_it_whatever_the_instant() {
 }
 
 #[test]
+fn a_point_with_the_largest_coordinate_keeps_its_row() {
+    // Readers let it pass, and what they give beside the points is ordered by these rows.
+    let mut sweeps = sweeps(2);
+    sweeps[0].points[0] = [1e6, 0.0, 0.0];
+    let still = MotionField {
+        ego: None,
+        residual: Residual::Still,
+    };
+    let plan = Plan::new(2, 0.0, LaterSweeps::Reverse, 1).expect("a plan");
+    let cloud = dense(&plan, &sweeps, &still, &still).expect("a cloud");
+    assert_eq!(cloud.points.len(), 4);
+    assert_eq!(cloud.points[0], [1e6, 0.0, 0.0]);
+}
+
+#[test]
 fn what_moves_is_integrated_step_by_step_and_ground_is_not() {
     // The vehicle stands still, so that the steps add up.
     let standing = Some(RigidTransform::identity());

@@ -12,9 +12,11 @@ use crate::flow::data::transform_point;
 use crate::flow::data::{Point, Random, RigidTransform};
 use crate::flow::data::{Progress, Uncontrolled};
 use crate::flow::error::FlowError;
+use crate::flow::field::{Backend, BackendError, Network, PreparedTarget};
+use crate::flow::host::Host;
 use crate::flow::motion::{MotionField, Residual};
 use crate::flow::options::Options;
-use crate::flow::options::{Ego, Ground, Preset};
+use crate::flow::options::{Ego, Ground, LossOptions, Preset};
 use crate::flow::problem::Problem;
 use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
 
@@ -142,6 +144,83 @@ fn a_deadline_before_the_first_iteration_still_gives_a_flow() {
     let now = After(0, Interrupt::Deadline, AtomicUsize::new(0));
     let estimate = estimated(&street(), &Preset::Neural.options(None), &now).expect("a flow");
     assert_eq!(estimate.fit().expect("a fit").iterations, 0);
+    assert!(estimate.flow.iter().flatten().all(|f| f.is_finite()));
+}
+
+/// A device that has no memory for cells below a size, metres. Counts the refusals.
+struct Scarce {
+    cpu: CpuBackend,
+    least_cell_m: f64,
+    refused: AtomicUsize,
+}
+
+impl Backend for Scarce {
+    fn name(&self) -> String {
+        "a device with little memory".to_owned()
+    }
+
+    fn host(&self) -> &Host {
+        self.cpu.host()
+    }
+
+    fn prepare_target(
+        &self,
+        source: &[Point],
+        target: &[Point],
+        options: &LossOptions,
+        control: &dyn Control,
+    ) -> Result<Box<dyn PreparedTarget>, BackendError> {
+        let distance = options.distance().expect("a distance transform");
+        if distance.transform.cell_m < self.least_cell_m {
+            return Err(match self.refused.fetch_add(1, Ordering::Relaxed) {
+                0 => BackendError::Busy,
+                _ => BackendError::Memory {
+                    what: "distance transform",
+                    needed: 2,
+                    available: 1,
+                },
+            });
+        }
+        self.cpu.prepare_target(source, target, options, control)
+    }
+
+    fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError> {
+        self.cpu.evaluate(network, points)
+    }
+}
+
+#[test]
+fn a_finer_transform_that_the_device_cannot_hold_leaves_the_coarse_one() {
+    /// A tenth of a second is left, on a clock that stands still.
+    struct Tight;
+    impl Control for Tight {
+        fn seconds_left(&self) -> Option<f64> {
+            Some(0.1)
+        }
+    }
+    let pair = street();
+    let mut options = Preset::Neural.options(None);
+    let field = options.field_mut().expect("a field");
+    field.max_iterations = 3;
+    let cell_m = field
+        .loss
+        .distance()
+        .expect("a distance transform")
+        .transform
+        .cell_m;
+    let backend = Scarce {
+        cpu: CpuBackend::new(Some(2)).expect("threads"),
+        least_cell_m: 3.0 * cell_m,
+        refused: AtomicUsize::new(0),
+    };
+    let problem = Problem::pair(&pair.source, &pair.target);
+    let estimate = estimate(&backend, &problem, &options, &Tight).expect("a flow");
+    assert_eq!(
+        backend.refused.load(Ordering::Relaxed),
+        2,
+        "both finer ones were tried"
+    );
+    assert!(estimate.fit().expect("a fit").iterations > 0);
     assert!(estimate.flow.iter().flatten().all(|f| f.is_finite()));
 }
 

@@ -172,8 +172,8 @@ pub trait Trainer: Send {
     /// same bits, this fit must have the same points, options and seed.
     ///
     /// # Errors
-    /// [`BackendError::Unsupported`] if `state` has another number of parameters, and
-    /// [`BackendError::Lost`] if the GPU is lost.
+    /// [`BackendError::Unsupported`] if `state` has another number of parameters,
+    /// [`BackendError::Busy`] if a GPU has no free memory, and [`BackendError::Lost`] if it is lost.
     fn restore(&mut self, state: TrainerState) -> Result<(), BackendError>;
 
     /// Lowers the maximum number of iterations to `max_iterations`; a larger value has no effect. A
@@ -230,8 +230,8 @@ pub enum BackendError {
     /// The linear model was refused: an option is out of range, or its grid needs too much memory.
     #[error(transparent)]
     Linear(#[from] LinearError),
-    /// The control interrupted the distance transform, before the first iteration.
-    #[error("interrupted before the first iteration")]
+    /// The control interrupted the work on a target, or the wait for a device.
+    #[error("interrupted")]
     Interrupted(Interrupt),
     /// The thread pool could not be started.
     #[error(transparent)]
@@ -264,6 +264,13 @@ pub enum BackendError {
     /// The GPU rejected a command: a defect of this program or of the driver.
     #[error("the device failed: {0}")]
     Device(String),
+}
+
+impl BackendError {
+    /// Whether the device only lacked memory, now or for this pair. This is no evidence against it.
+    pub(crate) fn is_out_of_memory(&self) -> bool {
+        matches!(self, Self::Busy | Self::Memory { .. })
+    }
 }
 
 impl From<DistanceError> for BackendError {

@@ -115,9 +115,12 @@ pub(crate) fn prepare_target(
             control,
             reserve: left * (1.0 - GIVEN_UP_SHARE),
         };
-        match prepare(coarser, &early)? {
-            Some(target) => return Ok(Some(prepared(coarser == 1.0)(target))),
-            None => break,
+        match prepare(coarser, &early) {
+            Ok(Some(target)) => return Ok(Some(prepared(coarser == 1.0)(target))),
+            Ok(None) => break,
+            // Coarser cells take less memory.
+            Err(FitError::Backend(error)) if error.is_out_of_memory() => {}
+            Err(error) => return Err(error),
         }
     }
     Ok(Some(prepared(false)(coarse)))

@@ -51,6 +51,7 @@ impl Allocation {
     ///
     /// # Errors
     /// [`BackendError::Memory`] if there are more than the words were taken for.
+    /// [`BackendError`] also as [`super::context::Context::write`].
     pub(super) fn write_points(&self, points: &[Point]) -> Result<u32, BackendError> {
         let (needed, available) = (points.len() as u64 * POINT_WORDS, self.point_words);
         if needed > available {
@@ -63,7 +64,7 @@ impl Allocation {
         let offset = u64::from(self.offset) + self.target_words;
         let context = &self.device.context;
         let (store, bytes) = (&context.buffers.store, bytemuck::cast_slice(points));
-        context.queue.write_buffer(store, offset * 4, bytes);
+        context.write(&[(store, offset * 4, bytes)])?;
         Ok(offset as u32)
     }
 }

@@ -1,6 +1,8 @@
 //! The GPU backend of the field fit.
 
+use core::time::Duration;
 use std::sync::Arc;
+use std::thread;
 
 use super::adapter::Adapter;
 use super::chamfer::GpuCloud;
@@ -15,6 +17,11 @@ use crate::flow::field::{Backend, BackendError, Network, PreparedTarget, Trainer
 use crate::flow::host::Host;
 use crate::flow::objects::{FoundRecord, PackedScene};
 use crate::flow::options::{FieldOptions, LossOptions};
+
+/// How often a device that is destroyed is asked whether what was submitted has ended: for a second.
+const MOST_POLLS: usize = 100;
+/// Interval at which it is asked.
+const POLL_INTERVAL: Duration = Duration::from_millis(10);
 
 /// An opened GPU, as a [`Backend`]. Clones share it, and each can fit a pair from its own thread.
 #[derive(Clone)]
@@ -64,13 +71,15 @@ impl Gpu {
 
     /// The tile that the GPU's matrix units multiply in half precision, such as
     /// `16x16x16 f16 -> f32`. The self-test of the matrix units runs once, at the first call or at
-    /// the first fit in half precision. All calls return its result.
+    /// the first fit in half precision. All calls return its result. It runs again only if the GPU
+    /// had no free memory for it.
     ///
     /// # Errors
     /// The reason why half precision is not available on this GPU, as text: a missing feature or
     /// tile, a failed self-test, or a failure of the GPU during the self-test.
     pub fn matrix_units(&self) -> Result<String, String> {
-        let units = self.0.tested_units().as_ref().map_err(Clone::clone)?;
+        let tested = self.0.tested_units().map_err(|error| error.to_string())?;
+        let units = tested.as_ref().map_err(Clone::clone)?;
         Ok(units.tile.name().to_owned())
     }
 
@@ -79,11 +88,21 @@ impl Gpu {
         self.0.context.watchdog.check().is_err()
     }
 
-    /// Destroys the device for all clones. All work on it fails with [`BackendError::Lost`] from
-    /// then on.
+    /// Destroys the device for all clones and frees its memory. All work on it fails with
+    /// [`BackendError::Lost`] from then on.
     pub fn destroy(&self) {
-        self.0.context.device.destroy();
-        self.0.context.watchdog.lost("it was given up".to_owned());
+        let context = &self.0.context;
+        context.watchdog.lost("it was given up".to_owned());
+        // A device that is destroyed keeps its buffers for as long as others have handles of them, and
+        // those of a submission until a poll finds that it has ended.
+        context.buffers.destroy();
+        context.device.destroy();
+        for _ in 0..MOST_POLLS {
+            match context.device.poll(wgpu::PollType::Poll) {
+                Ok(status) if !status.is_queue_empty() => thread::sleep(POLL_INTERVAL),
+                _ => break,
+            }
+        }
     }
 
     /// Mutable access to the device, for tests.

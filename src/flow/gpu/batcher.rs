@@ -17,11 +17,13 @@ use super::phase::Clock;
 use super::program::{Item, Program, SubmittedLoss};
 use super::request::{Request, write};
 use super::tiling::Plan;
-use crate::flow::data::locked;
+use crate::flow::data::{Control, locked};
 use crate::flow::field::BackendError;
 
 /// How long the submitting thread waits for further requests.
 const MOMENT: Duration = Duration::from_micros(300);
+/// Interval at which a waiting thread checks its control.
+const CHECK_INTERVAL: Duration = Duration::from_millis(200);
 
 /// The result of a request.
 #[derive(Clone, Debug)]
@@ -84,15 +86,18 @@ impl Batch {
         self.changed.notify_all();
     }
 
-    /// Runs the request's iterations, together with those that other threads request meanwhile.
+    /// Runs the request's iterations, together with those that other threads request meanwhile. Asks
+    /// `control` while it waits, which also shows that the pair is alive.
     ///
     /// # Errors
+    /// [`BackendError::Interrupted`] if the control interrupts before the iterations are submitted.
     /// [`BackendError`] if the GPU fails.
     pub(super) fn run<'u>(
         &self,
         context: &Context,
         units: &dyn Fn() -> Result<&'u Units, BackendError>,
         request: Request,
+        control: &dyn Control,
     ) -> Result<Done, BackendError> {
         let mut state = self.state();
         let ticket = state.next_ticket;
@@ -104,10 +109,22 @@ impl Batch {
                 return done;
             }
             if state.submitting {
+                drop(state);
+                let interrupt = control.interrupt();
+                state = self.state();
+                if let Some(interrupt) = interrupt
+                    && state.withdraw(ticket)
+                {
+                    self.changed.notify_all();
+                    return Err(BackendError::Interrupted(interrupt));
+                }
+                let waits =
+                    |state: &mut State| state.submitting && !state.done.contains_key(&ticket);
                 state = self
                     .changed
-                    .wait(state)
-                    .unwrap_or_else(PoisonError::into_inner);
+                    .wait_timeout_while(state, CHECK_INTERVAL, waits)
+                    .unwrap_or_else(PoisonError::into_inner)
+                    .0;
                 continue;
             }
             state.submitting = true;
@@ -120,7 +137,9 @@ impl Batch {
             let taken = state.take(context);
             drop(state);
             let requests: Vec<_> = taken.iter().map(|(_, request)| request).collect();
-            let submitted = catch_unwind(AssertUnwindSafe(|| submit(context, units, &requests)));
+            let submitted = catch_unwind(AssertUnwindSafe(|| {
+                submit(context, units, &requests, control)
+            }));
             let submitted = submitted.unwrap_or_else(|_| {
                 let reason = "the driver's bindings panicked".to_owned();
                 context.watchdog.lost(reason.clone());
@@ -152,6 +171,13 @@ impl Batch {
 }
 
 impl State {
+    /// Takes a request out of the queue. Returns false if it was submitted already.
+    fn withdraw(&mut self, ticket: u64) -> bool {
+        let before = self.waiting.len();
+        self.waiting.retain(|(other, _)| *other != ticket);
+        self.waiting.len() < before
+    }
+
     /// Number of waiting requests that can share a submission.
     fn shared_waiting(&self) -> usize {
         let shares = |(_, request): &&(u64, Request)| request.kind().shares_submissions();
@@ -185,11 +211,12 @@ impl State {
 const MOMENTS: u32 = 4;
 
 /// Runs the iterations of all requests in one submission. A lane with fewer iterations than others
-/// idles for the rest.
+/// idles for the rest. `control` is that of the submitting thread.
 fn submit<'u>(
     context: &Context,
     units: &dyn Fn() -> Result<&'u Units, BackendError>,
     requests: &[&Request],
+    control: &dyn Control,
 ) -> Result<Vec<Done>, BackendError> {
     context.watchdog.check()?;
     let iterations = requests.iter().map(|request| request.steps.len());
@@ -207,15 +234,15 @@ fn submit<'u>(
     let loss = SubmittedLoss::of(requests);
     let plan = Plan::new(&cuts, rows);
     let program = Program::new(&plan, loss, context.most_distances);
-    write(context, &context.buffers, requests);
+    write(context, &context.buffers, requests)?;
     let lanes = requests.len();
     let phases = Phases::bind(context, &context.buffers, &plan, lanes, model, loss)?;
-    let clock = Clock::new(context, MOMENTS);
+    let clock = Clock::new(context, MOMENTS)?;
 
     let mut encoder = context.encoder();
     for step in 0..iterations {
         let clock = clock.as_ref().filter(|_| step == 0);
-        iterate(&mut encoder, &phases, &program, step, clock)?;
+        iterate(&mut encoder, &phases, &program, (step, clock), control)?;
     }
     let status_bytes = (requests.len() * size_of::<Status>()) as u64;
     let loss_bytes = (requests.len() * STEPS * size_of::<f32>()) as u64;
@@ -232,15 +259,15 @@ fn submit<'u>(
 
     let (statuses, rest) = read.split_at(status_bytes as usize);
     let (losses, moments) = rest.split_at(loss_bytes as usize);
-    let pace = clock.map(|clock| {
-        let iteration = clock.seconds(moments, 0, 3);
-        let query = (clock.seconds(moments, 1, 2) / program.query_share).min(iteration);
+    let pace = clock.and_then(|clock| {
+        let iteration = clock.seconds(moments, 0, 3)?;
+        let query = clock.seconds(moments, 1, 2).unwrap_or(0.0) / program.query_share;
         let tiles = plan.tiles.len() as f64;
-        TileThroughput {
+        Some(TileThroughput {
             iteration,
             tile: iteration / tiles,
-            tile_query: query / tiles,
-        }
+            tile_query: query.min(iteration) / tiles,
+        })
     });
     let statuses = statuses.chunks_exact(size_of::<Status>());
     let losses = losses.chunks_exact(STEPS * size_of::<f32>());
@@ -261,12 +288,14 @@ fn submit<'u>(
 
 /// One iteration of all lanes. A timed iteration is split into several passes, because timestamps
 /// are taken at the boundaries of passes. A long one is split into several submissions to the driver.
+/// The control is asked after each of them only to show that the pair is alive: others share the
+/// iteration, which is always done as a whole.
 fn iterate(
     encoder: &mut wgpu::CommandEncoder,
     phases: &Phases<'_>,
     program: &Program,
-    step: usize,
-    clock: Option<&Clock>,
+    (step, clock): (usize, Option<&Clock>),
+    control: &dyn Control,
 ) -> Result<(), BackendError> {
     let run = |pass: &mut wgpu::ComputePass<'_>, items: &[Item]| {
         for (phase, wave) in items {
@@ -295,6 +324,7 @@ fn iterate(
             }
             if !program.is_whole {
                 phases.context.flush(encoder)?;
+                let _looked_at_between_iterations = control.interrupt();
             }
         }
     }

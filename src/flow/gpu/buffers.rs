@@ -49,6 +49,37 @@ impl Buffers {
         }
     }
 
+    /// Frees the memory as soon as the GPU has done what was submitted. Later use is an error.
+    pub(super) fn destroy(&self) {
+        let Self {
+            store,
+            networks,
+            activations,
+            deltas,
+            flows,
+            loss_gradients,
+            partials,
+            lanes,
+            steps,
+            statuses,
+            losses,
+        } = self;
+        for buffer in [
+            store,
+            networks,
+            activations,
+            deltas,
+            flows,
+            loss_gradients,
+            partials,
+        ] {
+            buffer.destroy();
+        }
+        for records in [lanes, steps, statuses, losses] {
+            records.destroy();
+        }
+    }
+
     /// Number of rows of a layer's activations.
     pub(super) fn rows(&self) -> u64 {
         self.flows.size() / ROW_VECTOR_BYTES
@@ -65,7 +96,7 @@ impl Buffers {
     ) -> Result<Self, BackendError> {
         let storage = wgpu::BufferUsages::STORAGE | more;
         let (to, from) = (wgpu::BufferUsages::COPY_DST, wgpu::BufferUsages::COPY_SRC);
-        let buffer = |what, bytes, usage| allocated(device, what, bytes, usage);
+        let buffer = |what, bytes, usage| allocated(device, what, bytes, usage, Mapping::None);
         let records = |bytes: usize| budget.lanes * bytes as u64;
         let row_vectors = budget.rows * ROW_VECTOR_BYTES;
         Ok(Self {
@@ -103,12 +134,27 @@ pub(super) fn largest(device: &wgpu::Device, usage: wgpu::BufferUsages) -> u64 {
     }
 }
 
+/// A buffer, an offset in it, and the bytes to write there: a whole number of 32-bit words.
+pub(super) type Write<'a> = (&'a wgpu::Buffer, u64, &'a [u8]);
+
+/// Whether the host writes to a buffer before its first use.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Mapping {
+    None,
+    AtCreation,
+}
+
 /// Allocates a buffer.
+///
+/// # Errors
+/// [`BackendError::Memory`] if the size exceeds the device's limit, or the GPU has too little
+/// memory.
 pub(super) fn allocated(
     device: &wgpu::Device,
     what: &'static str,
     bytes: u64,
     usage: wgpu::BufferUsages,
+    mapping: Mapping,
 ) -> Result<wgpu::Buffer, BackendError> {
     let limit = largest(device, usage);
     let refused = |available: u64| BackendError::Memory {
@@ -124,7 +170,7 @@ pub(super) fn allocated(
         label: Some(what),
         size: bytes,
         usage,
-        mapped_at_creation: false,
+        mapped_at_creation: mapping == Mapping::AtCreation,
     });
     match pollster::block_on(scope.pop()) {
         None => Ok(buffer),

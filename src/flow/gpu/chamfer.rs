@@ -55,8 +55,8 @@ impl GpuCloud {
         };
         let bytes = bytemuck::cast_slice(target);
         let offset = u64::from(allocation.offset) * 4;
-        let (queue, store) = (&device.context.queue, &device.context.buffers.store);
-        queue.write_buffer(store, offset, bytes);
+        let context = &device.context;
+        context.write(&[(&context.buffers.store, offset, bytes)])?;
         Ok(Self {
             device: Arc::clone(device),
             record,
@@ -102,9 +102,10 @@ impl GpuCloud {
             | wgpu::BufferUsages::COPY_DST
             | wgpu::BufferUsages::COPY_SRC;
         let store = context.empty((nearest + count) * 4, usage)?;
-        let queue = &context.queue;
-        queue.write_buffer(&store, 0, bytemuck::cast_slice(&self.target));
-        queue.write_buffer(&store, deformed * 4, bytemuck::cast_slice(points));
+        context.write(&[
+            (&store, 0, bytemuck::cast_slice(&self.target)),
+            (&store, deformed * 4, bytemuck::cast_slice(points)),
+        ])?;
         let lane = Lane {
             cloud: Cloud {
                 target_points: 0,
@@ -121,9 +122,11 @@ impl GpuCloud {
             searches: 1,
             ..Step::default()
         };
-        let lanes = context.filled(bytemuck::bytes_of(&lane))?;
-        let steps = context.filled(bytemuck::bytes_of(&step))?;
-        let statuses = context.filled(bytemuck::bytes_of(&Status::default()))?;
+        let [lanes, steps, statuses] = context.all_filled([
+            bytemuck::bytes_of(&lane),
+            bytemuck::bytes_of(&step),
+            bytemuck::bytes_of(&Status::default()),
+        ])?;
         let pipeline = &context.kernels.nearest;
         let group = context.bound(pipeline, &[&store, &lanes, &steps, &statuses]);
         let tiles = points.len().div_ceil(TILE);

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, mpsc};
 
 use super::adapter::{Adapter, AdapterKind};
 use super::allocator::Allocator;
-use super::buffers::{Buffers, allocated, largest};
+use super::buffers::{Buffers, Mapping, Write, allocated, largest};
 use super::health::Watchdog;
 use super::layout::ARRAYS;
 use super::matrix_units;
@@ -115,11 +115,6 @@ impl Context {
         free.pop().ok_or(BackendError::Busy)
     }
 
-    /// Whether no network is being fitted.
-    pub(super) fn is_idle(&self) -> bool {
-        locked(&self.networks).len() as u64 == self.budget.lanes
-    }
-
     pub(super) fn give_network_back(&self, network: u32) {
         let mut free = locked(&self.networks);
         free.push(network);
@@ -130,10 +125,27 @@ impl Context {
     /// # Errors
     /// As [`Self::empty`].
     pub(super) fn filled(&self, contents: &[u8]) -> Result<wgpu::Buffer, BackendError> {
+        self.all_filled([contents]).map(|[buffer]| buffer)
+    }
+
+    /// As [`Self::filled`], for several buffers in one submission.
+    ///
+    /// # Errors
+    /// As [`Self::empty`].
+    pub(super) fn all_filled<const N: usize>(
+        &self,
+        contents: [&[u8]; N],
+    ) -> Result<[wgpu::Buffer; N], BackendError> {
         let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST;
-        let buffer = self.empty(contents.len() as u64, usage)?;
-        self.queue.write_buffer(&buffer, 0, contents);
-        Ok(buffer)
+        let empty = |contents: &&[u8]| self.empty(contents.len() as u64, usage);
+        let buffers: Vec<_> = contents.iter().map(empty).collect::<Result<_, _>>()?;
+        let writes = buffers.iter().zip(contents);
+        let writes: Vec<Write<'_>> = writes
+            .map(|(buffer, contents)| (buffer, 0, contents))
+            .collect();
+        self.write(&writes)?;
+        let mut buffers = buffers.into_iter();
+        Ok([(); N].map(|()| buffers.next().expect("one for each contents")))
     }
 
     /// A temporary buffer of `bytes` bytes.
@@ -146,11 +158,23 @@ impl Context {
         bytes: u64,
         usage: wgpu::BufferUsages,
     ) -> Result<wgpu::Buffer, BackendError> {
-        let limit = largest(&self.device, usage);
-        allocated(&self.device, "work", bytes.max(16), usage).map_err(|error| match error {
-            BackendError::Memory { needed, .. } if needed <= limit => BackendError::Busy,
+        let buffer = allocated(&self.device, "work", bytes.max(16), usage, Mapping::None);
+        buffer.map_err(|error| self.busy_if_it_fits(error, usage))
+    }
+
+    /// [`BackendError::Busy`] instead of a lack of memory for a buffer with `usage` that is within
+    /// the device's limit.
+    pub(super) fn busy_if_it_fits(
+        &self,
+        error: BackendError,
+        usage: wgpu::BufferUsages,
+    ) -> BackendError {
+        match error {
+            BackendError::Memory { needed, .. } if needed <= largest(&self.device, usage) => {
+                BackendError::Busy
+            }
             error => error,
-        })
+        }
     }
 
     pub(super) fn bound(
@@ -262,7 +286,7 @@ impl Context {
     ///
     /// # Errors
     /// [`BackendError::Lost`] if the GPU does not answer.
-    fn wait(&self, submission: &wgpu::SubmissionIndex) -> Result<(), BackendError> {
+    pub(super) fn wait(&self, submission: &wgpu::SubmissionIndex) -> Result<(), BackendError> {
         let mut waited = Duration::ZERO;
         loop {
             self.watchdog.check()?;

@@ -74,16 +74,14 @@ pub(super) fn build(
         offset += words;
         own
     });
-    let write = |offset: u64, words: &[u8]| {
-        device
-            .context
-            .queue
-            .write_buffer(&device.context.buffers.store, offset * 4, words);
-    };
-    write(offsets[0], bytemuck::cast_slice(&index.tables));
-    write(offsets[1], bytemuck::cast_slice(&index.bricks));
-    write(offsets[3], bytemuck::cast_slice(&far.distances));
-    fill_bricks(&device.context, &index, &sites, band, offsets[2] as u32)?;
+    let context = &device.context;
+    let store = &context.buffers.store;
+    context.write(&[
+        (store, offsets[0] * 4, bytemuck::cast_slice(&index.tables)),
+        (store, offsets[1] * 4, bytemuck::cast_slice(&index.bricks)),
+        (store, offsets[3] * 4, bytemuck::cast_slice(&far.distances)),
+    ])?;
+    fill_bricks(context, &index, &sites, band, offsets[2] as u32)?;
 
     let lattice = Lattice::new(&grid);
     let record = layout::Transform {
@@ -131,14 +129,14 @@ fn fill_bricks(
         .map(|(y, &(layer, squares))| layout::Column { y, layer, squares })
         .collect();
     let code_of: Vec<u32> = sites.codes.iter().map(|&code| code.into()).collect();
-    let buffers = [
-        context.filled(bytemuck::bytes_of(&plan))?,
-        context.filled(bytemuck::cast_slice(&positions))?,
-        context.filled(bytemuck::cast_slice(sites.columns.starts()))?,
-        context.filled(bytemuck::cast_slice(&columns))?,
-        context.filled(bytemuck::cast_slice(&sites.squares))?,
-        context.filled(bytemuck::cast_slice(&code_of))?,
-    ];
+    let buffers = context.all_filled([
+        bytemuck::bytes_of(&plan),
+        bytemuck::cast_slice(&positions),
+        bytemuck::cast_slice(sites.columns.starts()),
+        bytemuck::cast_slice(&columns),
+        bytemuck::cast_slice(&sites.squares),
+        bytemuck::cast_slice(&code_of),
+    ])?;
     let pipeline = &context.kernels.bricks;
     let mut bound: Vec<_> = buffers.iter().collect();
     bound.push(&context.buffers.store);

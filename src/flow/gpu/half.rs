@@ -1,7 +1,7 @@
 //! Half precision on the GPU's matrix units: the kernels of a tile size, and their bindings in an
 //! iteration.
 
-use super::buffers::{Buffers, allocated, spread};
+use super::buffers::{Buffers, spread};
 use super::context::Context;
 use super::matrix_units::Tile;
 use super::phase::{Dispatch, Phase};
@@ -26,20 +26,18 @@ impl Units {
     /// Builds the kernels from `sources`, for `lanes` lanes.
     ///
     /// # Errors
-    /// The reason why half precision is not available on this GPU.
+    /// [`BackendError`] if the driver rejects a kernel, or the GPU has no free memory.
     pub(super) fn new(
         context: &Context,
         tile: Tile,
         sources: &[(&str, &str)],
         lanes: u64,
-    ) -> Result<Self, String> {
-        let text = |error: BackendError| error.to_string();
-        let usage = wgpu::BufferUsages::STORAGE;
-        let halves = allocated(&context.device, "halves", lanes * LANE_HALVES * 2, usage);
+    ) -> Result<Self, BackendError> {
+        let halves = lanes * LANE_HALVES * 2;
         Ok(Self {
             tile,
-            kernels: HalfKernels::new(&context.device, sources).map_err(text)?,
-            halves: halves.map_err(text)?,
+            kernels: HalfKernels::new(&context.device, sources)?,
+            halves: context.empty(halves, wgpu::BufferUsages::STORAGE)?,
         })
     }
 }

@@ -61,10 +61,12 @@ fn evaluated(
     let list: Vec<_> = (0..tiles as u32)
         .map(|tile| layout::Tile { lane: 0, tile })
         .collect();
-    let indices = context.filled(bytemuck::cast_slice(points))?;
-    let lane = context.filled(bytemuck::bytes_of(&lane))?;
-    let step = context.filled(bytemuck::bytes_of(&step))?;
-    let list = context.filled(bytemuck::cast_slice(&list))?;
+    let [indices, lane, step, list] = context.all_filled([
+        bytemuck::cast_slice(points),
+        bytemuck::bytes_of(&lane),
+        bytemuck::bytes_of(&step),
+        bytemuck::cast_slice(&list),
+    ])?;
     let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC;
     let flows = context.empty((tiles * TILE * 16) as u64, usage)?;
     let pipeline = &context.kernels.evaluate;

@@ -131,8 +131,10 @@ impl<'a> Phases<'a> {
         model: SubmittedModel<'a>,
         loss: SubmittedLoss,
     ) -> Result<Self, BackendError> {
-        let tiles = &context.filled(bytemuck::cast_slice(&plan.tiles))?;
-        let chunks = &context.filled(bytemuck::cast_slice(&plan.chunks))?;
+        let [tiles, chunks] = &context.all_filled([
+            bytemuck::cast_slice(&plan.tiles),
+            bytemuck::cast_slice(&plan.chunks),
+        ])?;
         let storage = wgpu::BufferUsages::STORAGE;
         let tile_losses = &context.empty(plan.tiles.len() as u64 * 4, storage)?;
         let kernels = &context.kernels;

@@ -63,16 +63,22 @@ impl LinearFit {
         schedule: &Schedule,
     ) -> Result<Self, BackendError> {
         let alive = Arc::clone(&context.linear_fits);
-        let fit = Self::allocated(context, threads, grid, variation_weight, schedule);
-        fit.map_err(|error| match error {
-            // No other fit would release enough.
-            BackendError::Busy if Arc::strong_count(&alive) <= 2 && context.is_idle() => {
-                BackendError::Memory {
-                    what: "linear model",
-                    needed: grid.bytes() as u64,
-                    available: 0,
-                }
+        let allocate = || Self::allocated(context, threads, grid, variation_weight, schedule);
+        let fit = match allocate() {
+            Err(BackendError::Busy) => {
+                // What other fits have for a moment is free after what is submitted so far.
+                context.flush(&mut context.encoder())?;
+                allocate()
             }
+            fit => fit,
+        };
+        fit.map_err(|error| match error {
+            // No other linear model would release enough, and networks have no memory of their own.
+            BackendError::Busy if Arc::strong_count(&alive) <= 2 => BackendError::Memory {
+                what: "linear model",
+                needed: grid.bytes() as u64,
+                available: 0,
+            },
             error => error,
         })
     }
@@ -147,13 +153,17 @@ impl LinearFit {
     }
 
     /// Replaces its arrays.
-    pub(super) fn write(&self, context: &Context, arrays: &Arrays<'_>) {
+    ///
+    /// # Errors
+    /// As [`Context::write`].
+    pub(super) fn write(&self, context: &Context, arrays: &Arrays<'_>) -> Result<(), BackendError> {
         let bytes = self.floats() as u64 * 4;
-        for (array, parameters) in arrays.0 {
+        let writes = arrays.0.map(|(array, parameters)| {
             let floats = &parameters.as_slice()[..self.floats()];
-            let (queue, at) = (&context.queue, array * bytes);
-            queue.write_buffer(&self.arrays, at, bytemuck::cast_slice(floats));
-        }
+            let contents: &[u8] = bytemuck::cast_slice(floats);
+            (&self.arrays, array * bytes, contents)
+        });
+        context.write(&writes)
     }
 
     /// All its arrays.
@@ -175,9 +185,11 @@ impl LinearFit {
             steps: 1,
             ..Lane::default()
         };
-        let lanes = context.filled(bytemuck::bytes_of(&lane))?;
-        let statuses = context.filled(bytemuck::bytes_of(&Status::default()))?;
-        let first = context.filled(bytemuck::bytes_of(&first))?;
+        let [lanes, statuses, first] = context.all_filled([
+            bytemuck::bytes_of(&lane),
+            bytemuck::bytes_of(&Status::default()),
+            bytemuck::bytes_of(&first),
+        ])?;
         let [_, y, z] = &self.axes;
         let groups = self.products(
             context,

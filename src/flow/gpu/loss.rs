@@ -97,6 +97,15 @@ impl<'a> GpuLoss<'a> {
         }
     }
 
+    /// `steps` iterations after `done` others, or fewer if a new search of nearest neighbors follows
+    /// them: only there can the state of the fit be taken.
+    pub(super) fn up_to_a_search(&self, done: usize, steps: usize) -> usize {
+        let before_a_search = (1..=steps)
+            .rev()
+            .find(|&steps| !self.depends_on_earlier(done + steps));
+        before_a_search.unwrap_or(steps)
+    }
+
     /// Writes its part of the record of the iteration after `done` others, over `batch`. `searched` is
     /// the batch that nearest neighbors were searched for last.
     pub(super) fn describe_step(

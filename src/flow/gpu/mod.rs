@@ -37,6 +37,7 @@ mod self_test;
 mod tests;
 mod tiling;
 mod trainer;
+mod upload;
 
 pub use adapter::{Adapter, AdapterKind, Selector, adapters, select};
 pub use backend::Gpu;

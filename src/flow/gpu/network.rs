@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use super::buffers::Write;
 use super::device::Device;
 use super::layout::{ARRAYS, Arrays, PARAMETERS, TRANSPOSED};
 use super::memory::NETWORK_BYTES;
@@ -63,15 +64,21 @@ impl NetworkFit {
     }
 
     /// Replaces its arrays.
-    pub(super) fn write(&self, arrays: &Arrays<'_>) {
+    ///
+    /// # Errors
+    /// As [`super::context::Context::write`].
+    pub(super) fn write(&self, arrays: &Arrays<'_>) -> Result<(), BackendError> {
         let mut transposed = mlp::zeros();
         transpose_middle_layers(arrays.parameters().as_slice(), transposed.as_mut_slice());
         let context = &self.slot.device.context;
-        for (array, parameters) in arrays.0.into_iter().chain([(TRANSPOSED, &transposed)]) {
-            let bytes = bytemuck::cast_slice(&parameters.as_slice()[..LAID_OUT]);
-            let networks = &context.buffers.networks;
-            context.queue.write_buffer(networks, self.at(array), bytes);
-        }
+        let all = arrays.0.into_iter().chain([(TRANSPOSED, &transposed)]);
+        let writes: Vec<Write<'_>> = all
+            .map(|(array, parameters)| {
+                let bytes = bytemuck::cast_slice(&parameters.as_slice()[..LAID_OUT]);
+                (&context.buffers.networks, self.at(array), bytes)
+            })
+            .collect();
+        context.write(&writes)
     }
 
     /// All its arrays.

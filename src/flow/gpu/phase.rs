@@ -1,6 +1,7 @@
 //! The phases (kernels) of an iteration, and GPU timestamps.
 
 use super::context::Context;
+use crate::flow::field::BackendError;
 
 /// A kernel of an iteration.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -43,25 +44,32 @@ pub(super) struct Clock {
 
 impl Clock {
     /// A set of `moments` timestamps; none if the GPU has no timestamps.
-    pub(super) fn new(context: &Context, moments: u32) -> Option<Self> {
-        let tick = context.tick?;
+    ///
+    /// # Errors
+    /// [`BackendError::Busy`] if the GPU has no free memory now.
+    pub(super) fn new(context: &Context, moments: u32) -> Result<Option<Self>, BackendError> {
+        let Some(tick) = context.tick else {
+            return Ok(None);
+        };
+        let scope = context
+            .device
+            .push_error_scope(wgpu::ErrorFilter::OutOfMemory);
         let set = context.device.create_query_set(&wgpu::QuerySetDescriptor {
             label: None,
             ty: wgpu::QueryType::Timestamp,
             count: moments,
         });
-        let resolved = context.device.create_buffer(&wgpu::BufferDescriptor {
-            label: None,
-            size: u64::from(moments) * 8,
-            usage: wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC,
-            mapped_at_creation: false,
-        });
-        Some(Self {
+        if pollster::block_on(scope.pop()).is_some() {
+            return Err(BackendError::Busy);
+        }
+        let usage = wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC;
+        let resolved = context.empty(u64::from(moments) * 8, usage)?;
+        Ok(Some(Self {
             set,
             resolved,
             moments,
             tick,
-        })
+        }))
     }
 
     /// A compute pass whose begin and end are recorded at these indices.
@@ -88,9 +96,11 @@ impl Clock {
         encoder.copy_buffer_to_buffer(&self.resolved, 0, to, at, bytes);
     }
 
-    /// Seconds between two of the timestamps that [`Self::resolve`] wrote.
-    pub(super) fn seconds(&self, moments: &[u8], from: usize, to: usize) -> f64 {
+    /// Seconds between two of the timestamps that [`Self::resolve`] wrote; none if the second is not
+    /// later, as with a driver that does not write them.
+    pub(super) fn seconds(&self, moments: &[u8], from: usize, to: usize) -> Option<f64> {
         let at = |index: usize| u64::from_ne_bytes(moments.as_chunks::<8>().0[index]);
-        at(to).saturating_sub(at(from)) as f64 * self.tick
+        let ticks = at(to).checked_sub(at(from)).filter(|&ticks| ticks > 0)?;
+        Some(ticks as f64 * self.tick)
     }
 }

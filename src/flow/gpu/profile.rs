@@ -140,7 +140,7 @@ fn timed(
     };
     // The network keeps its initial parameters, because the step size is zero.
     let request = GpuTrainer::new(target, source, options, 0)?.repeated_iteration();
-    write(context, &context.buffers, &[&request]);
+    write(context, &context.buffers, &[&request])?;
     let model = SubmittedModel::of(&request.model, &|| device.units())?;
     let loss = SubmittedLoss::of(&[&request]);
     let phases = Phases::bind(context, &context.buffers, &plan, 1, model, loss)?;
@@ -170,10 +170,12 @@ fn timed(
         }
         let moments = read(gpu, encoder, &clock, 2 * kernels.len() as u64)?;
         for (index, time) in times.iter_mut().enumerate() {
+            // A short kernel may end within one tick.
             let seconds = clock.seconds(&moments, 2 * index, 2 * index + 1);
-            time.seconds = time.seconds.min(seconds);
-            busy += seconds;
+            time.seconds = time.seconds.min(seconds.unwrap_or(0.0));
         }
+        let whole = clock.seconds(&moments, 0, 2 * kernels.len() - 1);
+        busy += whole.ok_or(NO_CLOCK)?;
     }
     Ok(times)
 }
@@ -213,7 +215,7 @@ pub fn arithmetic_peak(gpu: &Gpu) -> Result<f64, BackendError> {
             pass.dispatch_workgroups(x, y, 1);
         }
         let moments = read(gpu, encoder, &clock, 2)?;
-        let seconds = clock.seconds(&moments, 0, 1);
+        let seconds = clock.seconds(&moments, 0, 1).ok_or(NO_CLOCK)?;
         best = best.max(f64::from(groups) * GROUP * OPERATIONS / seconds);
         busy += seconds;
         if seconds < WARM_SECONDS / 10.0 {
@@ -223,9 +225,11 @@ pub fn arithmetic_peak(gpu: &Gpu) -> Result<f64, BackendError> {
     Ok(best)
 }
 
+/// A GPU without timestamps, or with timestamps that stand still.
+const NO_CLOCK: BackendError = BackendError::Unsupported("the card shows no clock");
+
 fn clock(gpu: &Gpu, moments: u32) -> Result<Clock, BackendError> {
-    let text = "the card shows no clock";
-    Clock::new(&gpu.device().context, moments).ok_or(BackendError::Unsupported(text))
+    Clock::new(&gpu.device().context, moments)?.ok_or(NO_CLOCK)
 }
 
 /// Submits the commands and reads the timestamps.

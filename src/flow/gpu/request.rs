@@ -7,6 +7,7 @@ use super::context::Context;
 use super::layout::{Lane, STEPS, Status, Step};
 use super::linear::LinearFit;
 use super::tiling::Cut;
+use crate::flow::field::BackendError;
 use crate::flow::options::Precision;
 
 /// The model of a request.
@@ -80,7 +81,14 @@ impl Request {
 }
 
 /// Writes the records of all requests to the buffers that the kernels read.
-pub(super) fn write(context: &Context, buffers: &Buffers, requests: &[&Request]) {
+///
+/// # Errors
+/// As [`Context::write`].
+pub(super) fn write(
+    context: &Context,
+    buffers: &Buffers,
+    requests: &[&Request],
+) -> Result<(), BackendError> {
     let (mut first_tile, mut first_chunk) = (0, 0);
     let mut lanes = Vec::new();
     let mut steps = vec![Step::default(); requests.len() * STEPS];
@@ -98,8 +106,9 @@ pub(super) fn write(context: &Context, buffers: &Buffers, requests: &[&Request])
         steps[index * STEPS..][..request.steps.len()].copy_from_slice(&request.steps);
     }
     let statuses: Vec<_> = requests.iter().map(|request| request.status).collect();
-    let write = |buffer: &wgpu::Buffer, bytes: &[u8]| context.queue.write_buffer(buffer, 0, bytes);
-    write(&buffers.lanes, bytemuck::cast_slice(&lanes));
-    write(&buffers.steps, bytemuck::cast_slice(&steps));
-    write(&buffers.statuses, bytemuck::cast_slice(&statuses));
+    context.write(&[
+        (&buffers.lanes, 0, bytemuck::cast_slice(&lanes)),
+        (&buffers.steps, 0, bytemuck::cast_slice(&steps)),
+        (&buffers.statuses, 0, bytemuck::cast_slice(&statuses)),
+    ])
 }

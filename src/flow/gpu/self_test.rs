@@ -31,6 +31,20 @@ const POINTS: usize = 2000;
 /// are off by a few times that, relative to the largest. A wrong tile is off by about one.
 const TOLERANCE: f32 = 0.01;
 
+/// Why half precision is not available on a GPU.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum SelfTestError {
+    /// The test could not be done.
+    #[error(transparent)]
+    Backend(#[from] BackendError),
+    /// It has no matrix units that the kernels support.
+    #[error("{0}")]
+    NoUnits(String),
+    /// A result differs from that of single precision.
+    #[error("its matrix units failed their self-test: {what} is off by {off:.3} of the largest")]
+    Differs { what: String, off: f32 },
+}
+
 /// Builds the half-precision kernels and compares them with those of single precision.
 ///
 /// # Errors
@@ -39,17 +53,17 @@ pub(super) fn tested_units(
     context: &Context,
     tile: Tile,
     sources: &[(&str, &str)],
-) -> Result<Units, String> {
+) -> Result<Units, SelfTestError> {
     run(context, &Units::new(context, tile, sources, 1)?)?;
-    Units::new(context, tile, sources, context.budget.lanes)
+    Ok(Units::new(context, tile, sources, context.budget.lanes)?)
 }
 
 /// Compares the kernels.
 ///
 /// # Errors
 /// The result that differs, or the failure that prevented the comparison.
-fn run(context: &Context, units: &Units) -> Result<(), String> {
-    let [single, half] = computed(context, units).map_err(|error| error.to_string())?;
+fn run(context: &Context, units: &Units) -> Result<(), SelfTestError> {
+    let [single, half] = computed(context, units)?;
     let layer = TILE * POINTS.div_ceil(TILE) * WIDTH;
     for (name, single, half) in [
         ("activations", &single.activations, &half.activations),
@@ -58,10 +72,10 @@ fn run(context: &Context, units: &Units) -> Result<(), String> {
         for number in 0..HIDDEN_LAYERS {
             let span = number * layer..(number + 1) * layer;
             let what = format!("the {name} of hidden layer {number}");
-            compare(&what, &single[span.clone()], &half[span])?;
+            compare(what, &single[span.clone()], &half[span])?;
         }
     }
-    compare("the flow", &single.flows, &half.flows)?;
+    compare("the flow".to_owned(), &single.flows, &half.flows)?;
     let chunks = single.gradients.chunks_exact(LAID_OUT);
     for (single, half) in chunks.zip(half.gradients.chunks_exact(LAID_OUT)) {
         let starts = (0..MIDDLE_LAYERS).map(|number| middle_layer(number).weights);
@@ -69,7 +83,7 @@ fn run(context: &Context, units: &Units) -> Result<(), String> {
         let mut start = 0;
         for (number, end) in ends.into_iter().enumerate() {
             let what = format!("the gradient of layer {number}");
-            compare(&what, &single[start..end], &half[start..end])?;
+            compare(what, &single[start..end], &half[start..end])?;
             start = end;
         }
     }
@@ -78,16 +92,14 @@ fn run(context: &Context, units: &Units) -> Result<(), String> {
 
 /// # Errors
 /// The relative difference, if it exceeds the tolerance.
-fn compare(what: &str, single: &[f32], half: &[f32]) -> Result<(), String> {
+fn compare(what: String, single: &[f32], half: &[f32]) -> Result<(), SelfTestError> {
     let largest = single.iter().fold(0.0f32, |most, x| most.max(x.abs()));
     let pairs = single.iter().zip(half);
     let off = largest_of(pairs.map(|(a, b)| (a - b).abs() / largest));
     if off <= TOLERANCE {
         return Ok(());
     }
-    Err(format!(
-        "its matrix units failed their self-test: {what} is off by {off:.3} of the largest"
-    ))
+    Err(SelfTestError::Differs { what, off })
 }
 
 /// The results of the kernels of one precision.
@@ -113,9 +125,10 @@ fn computed(context: &Context, units: &Units) -> Result<[Computed; 2], BackendEr
         store_words: 3 * POINTS as u64,
     };
     let more = wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST;
-    let buffers = Buffers::allocate(&context.device, &budget, more)?;
+    let buffers = Buffers::allocate(&context.device, &budget, more);
+    let buffers = buffers.map_err(|error| context.busy_if_it_fits(error, more))?;
     let plan = Plan::new(&[cut], cut.tiles * TILE);
-    fill(context, &buffers, cut);
+    fill(context, &buffers, cut)?;
     let bind = |model| Phases::bind(context, &buffers, &plan, 1, model, SubmittedLoss::Distance);
     let single = bind(SubmittedModel::Network)?;
     let half = bind(SubmittedModel::Half(units))?;
@@ -171,7 +184,7 @@ fn computed(context: &Context, units: &Units) -> Result<[Computed; 2], BackendEr
 
 /// Writes random points, random loss gradients and a random network, with random biases in the
 /// middle layers.
-fn fill(context: &Context, buffers: &Buffers, cut: Cut) {
+fn fill(context: &Context, buffers: &Buffers, cut: Cut) -> Result<(), BackendError> {
     let mut random = Random::new(1);
     let mut parameters = mlp::xavier(&mut random);
     for number in 0..MIDDLE_LAYERS {
@@ -190,24 +203,18 @@ fn fill(context: &Context, buffers: &Buffers, cut: Cut) {
             false => [0.0; 4],
         })
         .collect();
-    let write = |buffer: &wgpu::Buffer, at: u64, floats: &[f32]| {
-        context
-            .queue
-            .write_buffer(buffer, at * 4, bytemuck::cast_slice(floats));
-    };
-    let laid_out = LAID_OUT as u64;
-    write(&buffers.store, 0, &points);
-    write(&buffers.networks, 0, &parameters.as_slice()[..LAID_OUT]);
-    write(
-        &buffers.networks,
-        laid_out,
-        &transposed.as_slice()[..LAID_OUT],
-    );
-    write(
-        &buffers.loss_gradients,
-        0,
-        bytemuck::cast_slice(&loss_gradients),
-    );
+    let network = [&parameters, &transposed].map(|own| &own.as_slice()[..LAID_OUT]);
+    let [parameters, transposed] = network.map(bytemuck::cast_slice);
+    context.write(&[
+        (&buffers.store, 0, bytemuck::cast_slice(&points)),
+        (&buffers.networks, 0, parameters),
+        (&buffers.networks, LAID_OUT as u64 * 4, transposed),
+        (
+            &buffers.loss_gradients,
+            0,
+            bytemuck::cast_slice(&loss_gradients),
+        ),
+    ])?;
     let request = Request {
         lane: Lane {
             scale: 1.0,
@@ -222,5 +229,5 @@ fn fill(context: &Context, buffers: &Buffers, cut: Cut) {
         model: Model::Network(Precision::F16),
         loss: LossKind::Distance,
     };
-    write_request(context, buffers, &[&request]);
+    write_request(context, buffers, &[&request])
 }

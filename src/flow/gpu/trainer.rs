@@ -27,6 +27,8 @@ use crate::flow::options::{FieldOptions, ModelOptions, Precision};
 const SUBMISSION_SECONDS: f64 = 0.03;
 /// Iterations per submission if the GPU has no timestamps.
 const BLIND_STEPS: usize = 4;
+/// The most iterations of a submission, relative to the one before.
+const GROWTH: usize = 4;
 /// Maximum number of iterations per submission if a stopping rule may end the fit at any iteration.
 const STOPPABLE_STEPS: usize = 16;
 
@@ -60,6 +62,8 @@ pub(super) struct GpuTrainer<'a> {
     searched: Option<Range<usize>>,
     /// Speed of the latest submission whose first iteration had a query.
     pace: Option<TileThroughput>,
+    /// Iterations of the latest submission.
+    submitted: usize,
     /// The field of a linear model, if it was computed since the last iteration.
     decoded: Option<LinearField>,
     query_seconds: f64,
@@ -117,6 +121,7 @@ impl<'a> GpuTrainer<'a> {
             status: Status::default(),
             searched: None,
             pace: None,
+            submitted: 0,
             decoded: None,
             query_seconds: 0.0,
         };
@@ -188,18 +193,19 @@ impl<'a> GpuTrainer<'a> {
     }
 
     /// Runs up to `steps` iterations in one submission.
-    fn submit(&mut self, steps: usize) -> Result<Done, BackendError> {
+    fn submit(&mut self, steps: usize, control: &dyn Control) -> Result<Done, BackendError> {
         let mut searched = self.searched.clone();
         let request = self.request(steps, &mut searched);
         let steps = request.steps.clone();
-        let device = &self.device;
+        let (device, batch) = (&self.device, &self.device.batch);
         let units = || device.units();
-        let done = device.batch.run(&device.context, &units, request)?;
+        let done = batch.run(&device.context, &units, request, control)?;
+        self.submitted = steps.len();
         self.searched = searched;
         self.decoded = None;
         self.status = done.status;
         if self.loss.queries(&steps[..1]) > 0 {
-            self.pace = done.pace;
+            self.pace = done.pace.or(self.pace);
         }
         if let Some(pace) = self.pace {
             let queries = self.loss.queries(&steps[..done.losses.len()]);
@@ -231,10 +237,11 @@ impl<'a> GpuTrainer<'a> {
             Some(_) => STOPPABLE_STEPS,
             None => STEPS,
         };
+        let most = most.min(GROWTH * self.submitted.max(1));
         match seconds {
             Some(seconds) => ((SUBMISSION_SECONDS / seconds.max(1e-6)) as usize).clamp(1, most),
             // The first submission measures the GPU's speed.
-            None if self.device.context.tick.is_some() => 1,
+            None if self.device.context.tick.is_some() && self.submitted == 0 => 1,
             None => BLIND_STEPS,
         }
     }
@@ -264,7 +271,13 @@ impl Trainer for GpuTrainer<'_> {
             }
             let before = self.iterations();
             let steps = self.stride().min(steps - done).min(most - before);
-            let submitted = self.submit(steps)?;
+            let steps = self.loss.up_to_a_search(before, steps);
+            let submitted = match self.submit(steps, control) {
+                Err(BackendError::Interrupted(interrupt)) => {
+                    return Ok(Advance::Interrupted(interrupt));
+                }
+                submitted => submitted?,
+            };
             for (iteration, &loss) in (before + 1..).zip(&submitted.losses) {
                 control.progress(Progress {
                     done: iteration,
@@ -345,11 +358,11 @@ impl Trainer for GpuTrainer<'_> {
         match &self.model {
             GpuModel::Network(network) => {
                 check_state(&state, LAID_OUT)?;
-                network.write(&arrays);
+                network.write(&arrays)?;
             }
             GpuModel::Linear(linear) => {
                 check_state(&state, linear.floats())?;
-                linear.write(&self.device.context, &arrays);
+                linear.write(&self.device.context, &arrays)?;
             }
         }
         self.searched = None;

@@ -224,6 +224,27 @@ fn the_padding_of_the_rows_has_no_gradient_and_no_weight() {
 }
 
 #[test]
+fn the_field_of_a_result_is_computed_once_and_again_after_it_changes() {
+    let points = cloud(50);
+    let (mut model, first) = model(Isa::available()[0], 1, &points);
+    let sets = WorkingSets::new(&model.encoder.threads, || model.working_set());
+    let mut second = first.zeros_like();
+    for (to, from) in second.as_mut_slice().iter_mut().zip(first.as_slice()) {
+        *to = 2.0 * from;
+    }
+    for parameters in [&first, &second] {
+        model.update(&first);
+        let expected = model
+            .field(parameters)
+            .flow(&points, &model.encoder.threads);
+        for _ in 0..2 {
+            assert_eq!(model.evaluate(parameters, &points, &sets), expected);
+        }
+        assert!(model.decoded.get().is_some(), "it is kept");
+    }
+}
+
+#[test]
 fn a_fitted_field_gives_the_flow_of_its_model_and_comes_back_from_its_bytes() {
     let points = cloud(60);
     let (model, parameters) = model(Isa::available()[0], 2, &points);

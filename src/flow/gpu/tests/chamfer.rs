@@ -1,16 +1,20 @@
 //! The search of nearest neighbors and the Chamfer distance on the GPU.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
 
 use super::{clouds, opened, scattered, shared};
 use crate::flow::cpu::{CpuBackend, Isa};
-use crate::flow::data::{Point, Uncontrolled};
+use crate::flow::data::{Control, Interrupt, Point, Uncontrolled};
 use crate::flow::field::{Advance, Backend};
 use crate::flow::gpu::backend::Gpu;
 use crate::flow::gpu::chamfer::GpuCloud;
+use crate::flow::gpu::loss::{GpuLoss, GpuTarget};
 use crate::flow::gpu::memory::GpuOptions;
 use crate::flow::options::{
-    ChamferOptions, EarlyStopOptions, FieldOptions, LossOptions, NearestSearch, Preset,
+    ChamferOptions, EarlyStopOptions, FieldOptions, LossOptions, NearestSearch, Preset, Renewal,
 };
 
 const OPTIONS: ChamferOptions = ChamferOptions {
@@ -127,6 +131,100 @@ fn iterations_in_pieces_have_the_bits_of_whole_ones() {
         cloud.expect("it fits").nearest(&source).expect("an answer")
     };
     assert_eq!(cloud(&pieces), cloud(whole));
+}
+
+/// Waits until `flag` is set.
+fn until(flag: &AtomicBool) {
+    let began = Instant::now();
+    while !flag.load(Ordering::Relaxed) {
+        assert!(began.elapsed() < Duration::from_secs(60), "in time");
+        thread::sleep(Duration::from_millis(1));
+    }
+}
+
+#[test]
+fn a_pair_that_waits_for_the_submission_of_another_obeys_its_control() {
+    /// Stops the submitting thread between two pieces of an iteration.
+    #[derive(Default)]
+    struct Submits {
+        asked: AtomicUsize,
+        submits: AtomicBool,
+        may_go_on: AtomicBool,
+    }
+    impl Control for Submits {
+        fn interrupt(&self) -> Option<Interrupt> {
+            // The first time is before the iteration.
+            if self.asked.fetch_add(1, Ordering::Relaxed) > 0 {
+                self.submits.store(true, Ordering::Relaxed);
+                until(&self.may_go_on);
+            }
+            None
+        }
+    }
+    /// Is cancelled after its iteration was asked for.
+    #[derive(Default)]
+    struct Waits(AtomicUsize);
+    impl Control for Waits {
+        fn interrupt(&self) -> Option<Interrupt> {
+            let asked = self.0.fetch_add(1, Ordering::Relaxed);
+            (asked > 0).then_some(Interrupt::Cancelled)
+        }
+    }
+    let two_lanes = GpuOptions {
+        lanes: 2,
+        ..GpuOptions::default()
+    };
+    let Some(mut gpu) = opened(&two_lanes) else {
+        return;
+    };
+    let device = Arc::get_mut(gpu.device_mut()).expect("one owner");
+    let context = Arc::get_mut(&mut device.context).expect("one owner");
+    context.most_distances = 300_000;
+    let (source, target) = (scattered(900, SPREAD, 7), scattered(1500, SPREAD, 8));
+    let options = Preset::NsfpBaseline.field();
+    let [first, second] = [(); 2].map(|()| {
+        let prepared = gpu.prepare_target(&source, &target, &options.loss, &Uncontrolled);
+        prepared.expect("small clouds fit")
+    });
+    let submits = Submits::default();
+    let mut trainer = second.start(&source, &options, 0).expect("a trainer");
+    thread::scope(|scope| {
+        let (source, options, control) = (&source, &options, &submits);
+        let submitting = scope.spawn(move || {
+            let mut trainer = first.start(source, options, 0).expect("a trainer");
+            trainer.advance(1, control)
+        });
+        until(&submits.submits);
+        let ended = trainer.advance(1, &Waits::default()).expect("no failure");
+        assert_eq!(ended, Advance::Interrupted(Interrupt::Cancelled));
+        submits.may_go_on.store(true, Ordering::Relaxed);
+        let ended = submitting.join().expect("no panic").expect("iterations");
+        assert_eq!(ended, Advance::Continues);
+    });
+    assert_eq!(trainer.report().iterations, 0);
+    trainer.advance(1, &Uncontrolled).expect("an iteration");
+    assert_eq!(trainer.report().iterations, 1);
+}
+
+#[test]
+fn submissions_end_where_the_state_of_the_fit_can_be_taken() {
+    let Some(gpu) = shared() else {
+        return;
+    };
+    let target = scattered(10, SPREAD, 9);
+    let options = ChamferOptions {
+        renewal: Some(Renewal { first: 4, every: 5 }),
+        ..OPTIONS
+    };
+    let cloud = GpuCloud::new(gpu.device(), 10, &target, &options, &Uncontrolled);
+    let cloud = cloud.expect("it fits");
+    let loss = GpuLoss::new(GpuTarget::Cloud(&cloud), &LossOptions::Chamfer(options));
+    let loss = loss.expect("a loss for clouds");
+    // Searches precede the iterations after 0, 1, 2, 3, 4, 9, 14, 19, ... others.
+    for (done, steps, ended) in [(0, 16, 14), (0, 3, 3), (4, 16, 19), (9, 4, 13), (13, 4, 14)] {
+        let steps = loss.up_to_a_search(done, steps);
+        assert_eq!(done + steps, ended);
+    }
 }
 
 #[test]

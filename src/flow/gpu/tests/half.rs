@@ -82,7 +82,7 @@ fn tested(gpu: &Gpu, kernel: &str, from: &str, to: &str) -> Result<Units, String
         .iter()
         .map(|(name, text)| (*name, text.as_str()))
         .collect();
-    tested_units(&gpu.device().context, tile, &sources)
+    tested_units(&gpu.device().context, tile, &sources).map_err(|error| error.to_string())
 }
 
 #[test]

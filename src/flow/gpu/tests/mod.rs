@@ -8,6 +8,7 @@ mod half;
 mod kernels;
 mod objects;
 mod shaders;
+mod upload;
 mod whole;
 
 use std::sync::OnceLock;
