@@ -3,7 +3,7 @@
 //! The library and the service refuse it: its decoder believes the counts of a damaged file.
 
 use std::io::Cursor;
-use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::panic::{AssertUnwindSafe, catch_unwind, set_hook, take_hook};
 
 use anyhow::{Context, bail};
 use las::{Builder, Reader, Writer};
@@ -23,8 +23,11 @@ pub(super) fn unpacked(bytes: Vec<u8>) -> anyhow::Result<Vec<u8>> {
     if !bytes.starts_with(b"LASF") || format & COMPRESSED == 0 {
         return Ok(bytes);
     }
-    // The decoder panics on some damaged files.
+    // The decoder panics on some damaged files. Its message would say nothing to the user.
+    let hook = take_hook();
+    set_hook(Box::new(|_| {}));
     let unpacked = catch_unwind(AssertUnwindSafe(|| unpack(bytes)));
+    set_hook(hook);
     unpacked.unwrap_or_else(|_| bail!("the compressed points are damaged"))
 }
 

@@ -55,5 +55,10 @@ fn a_damaged_laz_file_is_refused_by_name() {
         let ended = fnsf(folder, &["flow", "a.laz", "b.laz", "-o", "flow.npz"]);
         assert_eq!(ended.code, 65, "{name}: {}", ended.stderr);
         assert!(ended.stderr.contains("a.laz"), "{name}: {}", ended.stderr);
+        assert!(
+            !ended.stderr.contains("panicked"),
+            "{name}: {}",
+            ended.stderr
+        );
     }
 }
