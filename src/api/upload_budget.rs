@@ -4,6 +4,7 @@
 //! requests need it.
 
 use std::collections::HashMap;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -46,10 +47,36 @@ pub(super) struct UploadBudget {
     metrics: Arc<Metrics>,
 }
 
+/// Bytes that the messages of a request hold, beside the clouds that are made of them. An extension of
+/// the request. They may grow during a pause.
+#[derive(Clone, Debug, Default)]
+pub(super) struct MessageMemory(Arc<AtomicU64>);
+
+impl MessageMemory {
+    /// The bytes.
+    fn bytes(&self) -> u64 {
+        self.0.load(Ordering::Relaxed)
+    }
+
+    /// Replaces the bytes.
+    pub(super) fn set(&self, bytes: u64) {
+        self.0.store(bytes, Ordering::Relaxed);
+    }
+}
+
 struct Paused {
     tenant: Tenant,
     since: Instant,
     end: CancellationToken,
+    /// Bytes of clouds, and of messages.
+    clouds: u64,
+    messages: MessageMemory,
+}
+
+impl Paused {
+    fn holds_memory(&self) -> bool {
+        self.clouds + self.messages.bytes() > 0
+    }
 }
 
 impl UploadBudget {
@@ -86,7 +113,8 @@ impl UploadBudget {
             None => held.get(tenant).copied() == most,
         };
         let mut paused = locked(&self.paused);
-        let own = (0..paused.len()).filter(|&index| may_end(&paused[index].tenant));
+        let own = (0..paused.len())
+            .filter(|&index| may_end(&paused[index].tenant) && paused[index].holds_memory());
         if let Some(index) = own.min_by_key(|&index| paused[index].since)
             && paused[index].since.elapsed() >= self.limits.idle
         {
@@ -219,7 +247,7 @@ impl UploadReservation {
     }
 
     /// Waits for more of a stream without a time limit. `besides` is the number of bytes that the
-    /// stream holds in other reservations. When other requests need memory, the longest pause of a
+    /// stream holds in other reservations of clouds, and `messages` that of messages. When other requests need memory, the longest pause of a
     /// tenant ends with an error, provided that it is at least as long as a body may be silent. A
     /// stream that holds no memory may pause forever.
     ///
@@ -228,16 +256,16 @@ impl UploadReservation {
     pub(super) async fn pause<T>(
         &self,
         besides: u64,
+        messages: &MessageMemory,
         more: impl Future<Output = T>,
     ) -> Result<T, ApiError> {
-        if besides + self.bytes() == 0 {
-            return Ok(more.await);
-        }
         let end = CancellationToken::new();
         locked(&self.uploads.paused).push(Paused {
             tenant: self.tenant.clone(),
             since: Instant::now(),
             end: end.clone(),
+            clouds: besides + self.bytes(),
+            messages: messages.clone(),
         });
         let _over = Over(&self.uploads, &end);
         tokio::select! {
@@ -327,7 +355,10 @@ mod tests {
         // A stream that holds no memory is never ended, however long it pauses.
         let empty = uploads.room(&tenant("a"));
         let pausing = |room: UploadReservation| {
-            tokio::spawn(async move { room.pause(0, std::future::pending::<()>()).await })
+            tokio::spawn(async move {
+                let none = MessageMemory::default();
+                room.pause(0, &none, std::future::pending::<()>()).await
+            })
         };
         let empty = pausing(empty);
         let first = pausing(first);
@@ -350,10 +381,31 @@ mod tests {
         let uploads = uploads();
         let mut room = uploads.room(&tenant("a"));
         room.take(1 << 20).expect("room");
-        let paused = tokio::spawn(async move { room.pause(0, std::future::pending::<()>()).await });
+        let paused = tokio::spawn(async move {
+            let none = MessageMemory::default();
+            room.pause(0, &none, std::future::pending::<()>()).await
+        });
         tokio::time::sleep(IDLE * 2).await;
         assert!(uploads.room(&tenant("a")).take(1).is_err());
         assert_eq!(paused.await.expect("no panic"), Err(ApiError::TooSlow));
         uploads.room(&tenant("a")).take(1).expect("room");
+    }
+
+    #[tokio::test]
+    async fn a_message_that_comes_during_a_pause_counts_as_memory_of_the_stream() {
+        let uploads = uploads();
+        let messages = MessageMemory::default();
+        let (empty, known) = (uploads.room(&tenant("a")), messages.clone());
+        let paused =
+            tokio::spawn(async move { empty.pause(0, &known, std::future::pending::<()>()).await });
+        tokio::time::sleep(IDLE * 2).await;
+        let mut room = uploads.room(&tenant("a"));
+        room.take(1 << 20).expect("room");
+        assert!(uploads.room(&tenant("a")).take(1).is_err());
+        tokio::time::sleep(IDLE / 4).await;
+        assert!(!paused.is_finished(), "it holds nothing");
+        messages.set(1);
+        assert!(uploads.room(&tenant("a")).take(1).is_err());
+        assert_eq!(paused.await.expect("no panic"), Err(ApiError::TooSlow));
     }
 }

@@ -7,6 +7,7 @@ use std::time::Duration;
 use axum::http;
 use bytes::Bytes;
 use fnsf::flow::Point;
+use prost::Message;
 use tonic::Code;
 
 use crate::clouds::small_pair;
@@ -405,6 +406,53 @@ async fn a_stream_that_stops_is_refused_in_time() {
             "{method}"
         );
     }
+    siege.stands().await;
+}
+
+#[tokio::test]
+async fn the_messages_of_streams_that_pause_are_in_the_budget_of_their_caller() {
+    use proto::estimate_sequence_request::{Begin, Part};
+    const CALLS: usize = 32;
+    let limits = "max_upload_mib = 8\nmax_total_upload_mib = 8\nbody_timeout_seconds = 60\n";
+    let siege = Besieged::new(&format!("[limits]\n{limits}")).await;
+    let method = "fnsf.v1.SceneFlow/EstimateSequence";
+    let begin = proto::EstimateSequenceRequest {
+        part: Some(Part::Begin(Begin::default())),
+    };
+    let begin = begin.encode_to_vec();
+    // A field that no message has, of nearly a mebibyte.
+    let mut unknown = vec![0xfa, 0x3f, 0x80, 0x80, 0x3c];
+    unknown.resize(5 + (15 << 16), 0);
+    unknown.extend(&begin);
+    let begin = message(0, begin.len() as u32, &begin);
+    let whole = message(0, 1 << 20, &vec![0; 1 << 20]);
+    let incomplete = [&begin, &whole[..1 << 20]].concat();
+    let large = message(0, unknown.len() as u32, &unknown);
+    let mut zipped = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    zipped.write_all(&unknown).expect("compressed");
+    let zipped = zipped.finish().expect("compressed");
+    let small = message(1, zipped.len() as u32, &zipped);
+    for (encoding, bytes) in [
+        ("identity", &incomplete),
+        ("identity", &large),
+        ("gzip", &small),
+    ] {
+        // What has memory pauses until the caller goes.
+        let calls = (0..CALLS).map(|_| {
+            let call = raw_encoded(&siege.server, method, encoding, bytes, false);
+            tokio::time::timeout(Duration::from_secs(5), call)
+        });
+        let codes = futures_util::future::join_all(calls).await;
+        let paused = codes.iter().filter(|code| code.is_err()).count();
+        let refused = |code: &&Result<Option<Code>, _>| **code == Ok(Some(Code::Unavailable));
+        let refused = codes.iter().filter(refused).count();
+        assert_eq!(paused + refused, CALLS, "{codes:?}");
+        assert!(0 < paused && paused <= 8, "{codes:?}");
+    }
+    // Small messages are in no budget, and such a stream may pause while others have none left.
+    let paused = raw(&siege.server, method, &begin, false);
+    let paused = tokio::time::timeout(Duration::from_secs(3), paused).await;
+    assert!(paused.is_err(), "{paused:?}");
     siege.stands().await;
 }
 

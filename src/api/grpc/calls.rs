@@ -21,7 +21,7 @@ use crate::api::result_budget::ReadProgress;
 use crate::api::service::{Service, Waited};
 use crate::api::sweep_order::SweepOrder;
 use crate::api::tracks::SequenceTracks;
-use crate::api::upload_budget::UploadReservation;
+use crate::api::upload_budget::{MessageMemory, UploadReservation};
 use crate::job::{InvalidId, Job, JobId, Kind, State};
 use crate::payload::StoredCloud;
 
@@ -157,15 +157,19 @@ async fn send_flow(
     Ok(true)
 }
 
-/// Sends the parts of a result until it is evicted for a slow client.
+/// Sends the parts of a result until it is evicted for a slow client. `held` is released before the
+/// client reads the error.
 async fn send_result(
     parts: impl Iterator<Item = proto::download_result_response::Part>,
     answers: mpsc::Sender<Result<proto::DownloadResultResponse, Status>>,
     taking: Arc<ReadProgress>,
+    held: impl Send,
 ) {
     let messages = parts.map(|part| proto::DownloadResultResponse { part: Some(part) });
-    if let Err(error) = chunks::send(messages, &answers, &taking).await {
-        let _gone_is_fine = answers.try_send(Err(error.into()));
+    let sent = chunks::send(messages, &answers, &taking).await;
+    drop(held);
+    if let Err(error) = sent {
+        let _gone_is_fine = answers.send(Err(error.into())).await;
     }
 }
 
@@ -218,7 +222,9 @@ impl SceneFlow for Calls {
         if let Some(asking) = request.extensions().get::<Asking>() {
             asking.may_wait();
         }
-        let answers = sequence::run(Arc::clone(&self.service), call, request.into_inner());
+        let messages = request.extensions().get::<MessageMemory>().cloned();
+        let (service, messages) = (Arc::clone(&self.service), messages.unwrap_or_default());
+        let answers = sequence::run(service, call, messages, request.into_inner());
         Ok(Response::new(Box::pin(answers)))
     }
 
@@ -407,8 +413,9 @@ impl SceneFlow for Calls {
         let (answers, stream) = mpsc::channel(AHEAD);
         tokio::spawn(async move {
             let sent = chunks::send(messages.into_iter(), &answers, room.taking()).await;
+            drop(room);
             if let Err(error) = sent {
-                let _gone_is_fine = answers.try_send(Err(error.into()));
+                let _gone_is_fine = answers.send(Err(error.into())).await;
             }
         });
         Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
@@ -429,16 +436,13 @@ impl SceneFlow for Calls {
         let (answers, stream) = mpsc::channel(AHEAD);
         if dense::is_dense(&job) {
             let header = convert::dense_header(job.id, &self.service.dense_report(&job)?);
-            // The permit is held as long as the client reads.
+            // Held as long as the client reads.
             let turn = self.service.archives.take(&job.tenant)?;
             let (cloud, room) = self.service.dense_cloud(&job).await?;
             let pieces = chunks::dense_pieces(cloud, first).map(Part::DenseChunk);
             let parts = std::iter::once(Part::DenseHeader(header)).chain(pieces);
             let taking = Arc::clone(room.taking());
-            tokio::spawn(async move {
-                let _while_it_is_read = (turn, room);
-                send_result(parts, answers, taking).await;
-            });
+            tokio::spawn(send_result(parts, answers, taking, (turn, room)));
         } else {
             let answer = self.service.answer(&job).await?;
             let header = Part::Header(convert::header(&answer));
@@ -446,7 +450,7 @@ impl SceneFlow for Calls {
             let parts = std::iter::once(header).chain(pieces);
             let taking = Arc::clone(answer.room.taking());
             drop(answer);
-            tokio::spawn(send_result(parts, answers, taking));
+            tokio::spawn(send_result(parts, answers, taking, ()));
         }
         Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
     }

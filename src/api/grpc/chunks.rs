@@ -1,12 +1,13 @@
 //! Conversion between chunks on the wire, and clouds and flow.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use prost::Message;
 use tokio::sync::mpsc;
-use tonic::{Status, Streaming};
+use tonic::{Code, Status, Streaming};
 
-use super::{convert, proto};
+use super::{convert, proto, status};
 use crate::api::codec;
 use crate::api::error::ApiError;
 use crate::api::result_budget::ReadProgress;
@@ -16,8 +17,9 @@ use crate::api::upload_budget::UploadReservation;
 use crate::flow::{DenseCloud, Point, RigidTransform};
 use crate::payload::{StoredCloud, points_from_le_bytes};
 
-/// Rows of flow in one chunk: below 1 MiB with all of its columns.
-const ROWS: usize = 38_000;
+/// Rows of flow, or of a dense cloud, in one chunk: about 25 kB with all columns. An answer that is
+/// not read keeps some chunks in memory that no budget has, so they are small.
+const ROWS: usize = 1000;
 
 /// Receives the next message, within the time limits of a body.
 ///
@@ -28,16 +30,20 @@ pub(super) async fn next<T>(
     room: &mut UploadReservation,
     inbound: &mut Streaming<T>,
 ) -> Result<Option<T>, ApiError> {
-    match room.wait(inbound.message()).await? {
-        Ok(message) => Ok(message),
-        Err(status) if status.code() == tonic::Code::OutOfRange => {
+    let came = room.wait(inbound.message()).await?;
+    came.map_err(|status| broken(&status))
+}
+
+/// The error of a stream of requests, which may be that of a [`super::message_body::MessageBody`].
+pub(super) fn broken(status: &Status) -> ApiError {
+    match (status.code(), status::own_code(status)) {
+        (_, Some("too_slow")) => ApiError::TooSlow,
+        (_, Some("server_full")) => ApiError::ServerFull(Duration::from_secs(1)),
+        (Code::OutOfRange, _) => {
             let text = "a message is larger than 1 MiB: send smaller chunks";
-            Err(ApiError::TooLarge(text.to_owned()))
+            ApiError::TooLarge(text.to_owned())
         }
-        Err(status) => Err(ApiError::BadRequest(format!(
-            "the stream is broken: {}",
-            status.message()
-        ))),
+        _ => ApiError::BadRequest(format!("the stream is broken: {}", status.message())),
     }
 }
 
@@ -124,35 +130,30 @@ impl CloudBuilder {
     }
 }
 
-/// Rows of a dense cloud in one chunk: below 1 MiB with all of its columns.
-const DENSE_ROWS: usize = 45_000;
-
 /// The chunks of a dense cloud from row `first`.
 pub(super) fn dense_pieces(
     cloud: Arc<DenseCloud>,
     first: usize,
 ) -> impl Iterator<Item = proto::DenseChunk> {
     let rows = cloud.points.len();
-    (first.min(rows)..rows)
-        .step_by(DENSE_ROWS)
-        .map(move |from| {
-            let piece = from..(from + DENSE_ROWS).min(rows);
-            let points = cloud.points[piece.clone()].as_flattened().iter();
-            let points: Vec<u8> = points.flat_map(|value| value.to_le_bytes()).collect();
-            let sweep = cloud.sweep[piece.clone()].iter();
-            let sweep: Vec<u8> = sweep.flat_map(|sweep| sweep.to_le_bytes()).collect();
-            let age = cloud.age[piece.clone()].iter();
-            let age: Vec<u8> = age.flat_map(|age| age.to_le_bytes()).collect();
-            let flags: Vec<u8> = piece
-                .map(|row| u8::from(cloud.dynamic[row]) | u8::from(cloud.converged[row]) << 1)
-                .collect();
-            proto::DenseChunk {
-                points: points.into(),
-                sweep: sweep.into(),
-                age: age.into(),
-                flags: flags.into(),
-            }
-        })
+    (first.min(rows)..rows).step_by(ROWS).map(move |from| {
+        let piece = from..(from + ROWS).min(rows);
+        let points = cloud.points[piece.clone()].as_flattened().iter();
+        let points: Vec<u8> = points.flat_map(|value| value.to_le_bytes()).collect();
+        let sweep = cloud.sweep[piece.clone()].iter();
+        let sweep: Vec<u8> = sweep.flat_map(|sweep| sweep.to_le_bytes()).collect();
+        let age = cloud.age[piece.clone()].iter();
+        let age: Vec<u8> = age.flat_map(|age| age.to_le_bytes()).collect();
+        let flags: Vec<u8> = piece
+            .map(|row| u8::from(cloud.dynamic[row]) | u8::from(cloud.converged[row]) << 1)
+            .collect();
+        proto::DenseChunk {
+            points: points.into(),
+            sweep: sweep.into(),
+            age: age.into(),
+            flags: flags.into(),
+        }
+    })
 }
 
 /// Sends the messages of a result in their order. Returns false if the client disconnects.

@@ -4,6 +4,7 @@ mod call;
 mod calls;
 mod chunks;
 mod convert;
+mod message_body;
 #[expect(unreachable_pub, reason = "generated code is public to its module")]
 #[expect(
     clippy::allow_attributes,

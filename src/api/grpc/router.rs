@@ -1,7 +1,6 @@
 //! The gRPC routes: the calls, health checks and reflection.
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use axum::body::Body;
 use axum::extract::{Request, State};
@@ -15,10 +14,13 @@ use tonic::server::NamedService;
 use tonic::service::Routes;
 use tonic_health::ServingStatus;
 
+use super::message_body::MessageBody;
 use super::{calls, proto};
+use crate::api::auth::Caller;
 use crate::api::error::ApiError;
 use crate::api::listener::bodies::{NotInTime, RequestBody, TimedBody};
 use crate::api::service::Service;
+use crate::api::upload_budget::MessageMemory;
 
 /// Maximum size of an incoming message, bytes: a chunk of 1 MiB and its envelope.
 const MAX_MESSAGE: usize = (1 << 20) + (64 << 10);
@@ -29,17 +31,33 @@ const MAX_SMALL_BODY: usize = 128 << 10;
 /// Maximum size of a message to the health service, bytes.
 const MAX_HEALTH_MESSAGE: usize = 4 << 10;
 
-/// Bounds the body of a call that takes no clouds in size and in time: an incomplete message is in no memory budget.
-async fn with_small_body(State(most): State<Duration>, request: Request, next: Next) -> Response {
+/// Bounds the memory of messages. With clouds, it is in the budget of the caller's uploads; a body
+/// without clouds is small, and comes in time as a whole.
+async fn with_bounds(
+    State(service): State<Arc<Service>>,
+    request: Request,
+    next: Next,
+) -> Response {
     let path = request.uri().path();
     let takes_clouds = ["/EstimateFlow", "/EstimateSequence", "/SubmitJob"];
-    if takes_clouds.iter().any(|call| path.ends_with(call)) {
-        return next.run(request).await;
-    }
-    let request = request.map(|body| {
-        let body = TimedBody::new(Limited::new(body, MAX_SMALL_BODY), most);
-        Body::new(RequestBody::new(body).map_err(status))
-    });
+    let takes_clouds = takes_clouds.iter().any(|call| path.ends_with(call));
+    let caller = request.extensions().get::<Caller>();
+    let room = caller.map(|caller| service.uploads.room(&caller.tenant));
+    let request = match room.filter(|_| takes_clouds) {
+        Some(room) => {
+            let memory = MessageMemory::default();
+            let mut request = request.map(|body| {
+                let body = MessageBody::new(body, MAX_MESSAGE, room, memory.clone());
+                Body::new(RequestBody::new(body))
+            });
+            request.extensions_mut().insert(memory);
+            request
+        }
+        None => request.map(|body| {
+            let body = TimedBody::new(Limited::new(body, MAX_SMALL_BODY), service.limits.body_idle);
+            Body::new(RequestBody::new(body).map_err(status))
+        }),
+    };
     next.run(request).await
 }
 
@@ -93,7 +111,6 @@ pub(crate) fn router(service: &Arc<Service>) -> Router {
             routes.add_service(older.expect("the descriptors are our own"));
         }
     }
-    let most = service.limits.body_idle;
-    let small = from_fn_with_state(most, with_small_body);
-    routes.routes().into_axum_router().layer(small)
+    let bounds = from_fn_with_state(Arc::clone(service), with_bounds);
+    routes.routes().into_axum_router().layer(bounds)
 }

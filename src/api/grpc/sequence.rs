@@ -21,7 +21,7 @@ use crate::api::kept_result::KeptResult;
 use crate::api::pending_job::{Accepted, PendingJob};
 use crate::api::service::{Service, Waited};
 use crate::api::sweep_order::SweepOrder;
-use crate::api::upload_budget::UploadReservation;
+use crate::api::upload_budget::{MessageMemory, UploadReservation};
 use crate::flow::{is_window_final, window};
 use crate::formats::SweepTime;
 use crate::job::{JobId, JobOptions, Kind};
@@ -92,6 +92,7 @@ impl Coming {
 pub(super) fn run(
     service: Arc<Service>,
     call: Call,
+    messages: MessageMemory,
     inbound: Streaming<proto::EstimateSequenceRequest>,
 ) -> ReceiverStream<Result<proto::EstimateSequenceResponse, Status>> {
     let (answers, stream) = mpsc::channel(2);
@@ -110,6 +111,7 @@ pub(super) fn run(
             order: SweepOrder::default(),
             before: None,
             options: JobOptions::default(),
+            messages,
         };
         if let Err(error) = reader.run().await {
             // The error follows the pairs of the complete sweeps, so that their flows are still
@@ -137,6 +139,8 @@ struct Reader {
     /// The job of the pair before. With a warm start the next pair starts from its field.
     before: Option<JobId>,
     options: JobOptions,
+    /// What its messages take.
+    messages: MessageMemory,
 }
 
 impl Reader {
@@ -162,12 +166,11 @@ impl Reader {
                 // A sweep that is known to be incomplete must continue to arrive.
                 room.wait(self.inbound.message()).await?
             } else {
-                room.pause(self.held_bytes(), self.inbound.message())
+                let held = self.held_bytes();
+                room.pause(held, &self.messages, self.inbound.message())
                     .await?
             };
-            let message = message.map_err(|status| {
-                ApiError::BadRequest(format!("the stream is broken: {}", status.message()))
-            })?;
+            let message = message.map_err(|status| chunks::broken(&status))?;
             let ended = message.is_none();
             let whole = match message.and_then(|message| message.part) {
                 Some(Part::Chunk(chunk)) => {
@@ -232,7 +235,10 @@ impl Reader {
     async fn submit_next(&mut self) -> Result<(), ApiError> {
         let place = self.pending.clone().reserve_owned();
         let place = match self.held.back() {
-            Some(latest) => latest.room.pause(self.held_bytes(), place).await,
+            Some(latest) => {
+                let held = self.held_bytes();
+                latest.room.pause(held, &self.messages, place).await
+            }
             None => Ok(place.await),
         };
         let place = match place {
@@ -311,14 +317,29 @@ async fn write(service: &Arc<Service>, mut items: mpsc::Receiver<Item>, answers:
             () = answers.closed() => return,
             sent = send(service, pair, answers) => sent,
         };
-        if !sent {
-            return;
+        match sent {
+            Ok(true) => {}
+            Ok(false) => return,
+            Err(error) => {
+                // Its memory and the pairs after it are gone before the client reads the error.
+                drop(items);
+                service.count_late_error("grpc", &error);
+                let _gone_is_fine = answers.send(Err(error.into())).await;
+                return;
+            }
         }
     }
 }
 
-/// Sends one pair. Returns false if the client has disconnected or the result was evicted.
-async fn send(service: &Arc<Service>, pair: Pending, answers: &ResultBudget) -> bool {
+/// Sends one pair. Returns false if the client has disconnected.
+///
+/// # Errors
+/// [`ApiError::TakenTooSlowly`] if the result was evicted.
+async fn send(
+    service: &Arc<Service>,
+    pair: Pending,
+    answers: &ResultBudget,
+) -> Result<bool, ApiError> {
     use proto::estimate_sequence_response::pair::Outcome;
     use proto::estimate_sequence_response::{Pair, Part};
     let message = |part: Part| proto::EstimateSequenceResponse { part: Some(part) };
@@ -345,20 +366,13 @@ async fn send(service: &Arc<Service>, pair: Pending, answers: &ResultBudget) -> 
         Err(error) => {
             service.count_late_error("grpc", &error);
             let failed = header(Outcome::Error(convert::pair_error(&error)));
-            answers.send(Ok(message(Part::Pair(failed)))).await.is_ok()
+            Ok(answers.send(Ok(message(Part::Pair(failed)))).await.is_ok())
         }
         Ok(answer) => {
             let head = header(Outcome::Header(Box::new(convert::header(&answer))));
             let pieces = chunks::pieces(&answer, 0).map(Part::Chunk);
             let messages = std::iter::once(Part::Pair(head)).chain(pieces).map(message);
-            match chunks::send(messages, answers, answer.room.taking()).await {
-                Ok(sent) => sent,
-                Err(error) => {
-                    service.count_late_error("grpc", &error);
-                    let _gone_is_fine = answers.try_send(Err(error.into()));
-                    false
-                }
-            }
+            chunks::send(messages, answers, answer.room.taking()).await
         }
     }
 }

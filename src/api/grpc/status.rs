@@ -42,6 +42,11 @@ pub(in crate::api) fn status(error: &ApiError) -> Status {
     status
 }
 
+/// The stable error code of a status that this server made.
+pub(super) fn own_code(status: &Status) -> Option<&str> {
+    status.metadata().get(CODE_KEY)?.to_str().ok()
+}
+
 /// The error table row of a gRPC response, from its headers. `None` if it is not an error.
 pub(in crate::api) fn row_of(headers: &axum::http::HeaderMap) -> Option<ErrorSpec> {
     ErrorSpec::of(headers.get(CODE_KEY)?.to_str().ok()?)

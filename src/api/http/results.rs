@@ -355,7 +355,12 @@ async fn archive(
         let done = write().and_then(|()| Ok(zip.finish().map(drop)?));
         if let Err(error) = done {
             tracing::debug!(%error, "an archive was not finished");
-            let _gone_is_fine = pieces.try_send(Err(std::io::Error::other("not finished")));
+            // Without it the response would end as if it were whole. The client may read it late.
+            runtime.spawn(async move {
+                let _gone_is_fine = pieces
+                    .send(Err(std::io::Error::other("not finished")))
+                    .await;
+            });
         }
     });
     let mut response = Body::from_stream(ReceiverStream::new(stream)).into_response();
