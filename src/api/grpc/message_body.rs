@@ -38,8 +38,9 @@ struct Frames {
     known: usize,
     /// Bytes that are missing from the message.
     missing: u64,
-    /// Bytes of the largest message so far, compressed as it came, and of the largest compressed one.
+    /// Bytes of the largest message so far, as it came.
     largest: u64,
+    /// Whether a message was compressed.
     is_compressed: bool,
 }
 
