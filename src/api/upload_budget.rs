@@ -247,9 +247,9 @@ impl UploadReservation {
     }
 
     /// Waits for more of a stream without a time limit. `besides` is the number of bytes that the
-    /// stream holds in other reservations of clouds, and `messages` that of messages. When other requests need memory, the longest pause of a
-    /// tenant ends with an error, provided that it is at least as long as a body may be silent. A
-    /// stream that holds no memory may pause forever.
+    /// stream holds in other reservations of clouds, and `messages` that of messages. When other
+    /// requests need memory, the longest pause of a tenant ends with an error, provided that it is at
+    /// least as long as a body may be silent. A stream that holds no memory may pause forever.
     ///
     /// # Errors
     /// [`ApiError::TooSlow`].

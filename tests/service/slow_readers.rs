@@ -131,7 +131,7 @@ async fn a_stream_whose_memory_others_need_leaves_no_pair_out_before_its_end() {
     assert_eq!(indices, (0..indices.len()).collect::<Vec<_>>());
 }
 
-/// A job of `sweeps` sweeps of a street, which has ended.
+/// A job that has ended, of a sweep of a street for each of `names`, and the points of the first.
 async fn job(server: &Server, path: &str, names: &[&str]) -> (String, usize) {
     let street = Street::new(&StreetOptions {
         beams: 32,

@@ -157,15 +157,14 @@ async fn send_flow(
     Ok(true)
 }
 
-/// Sends the parts of a result until it is evicted for a slow client. `held` is released before the
-/// client reads the error.
-async fn send_result(
-    parts: impl Iterator<Item = proto::download_result_response::Part>,
-    answers: mpsc::Sender<Result<proto::DownloadResultResponse, Status>>,
+/// Sends the messages of a result until it is evicted for a slow client. `held` is released before
+/// the client reads the error.
+async fn send_result<M: Message>(
+    messages: impl Iterator<Item = M>,
+    answers: mpsc::Sender<Result<M, Status>>,
     taking: Arc<ReadProgress>,
     held: impl Send,
 ) {
-    let messages = parts.map(|part| proto::DownloadResultResponse { part: Some(part) });
     let sent = chunks::send(messages, &answers, &taking).await;
     drop(held);
     if let Err(error) = sent {
@@ -411,13 +410,8 @@ impl SceneFlow for Calls {
         let bytes = messages.iter().map(Message::encoded_len).sum();
         let room = self.service.answers.room(&job.tenant, bytes).await?;
         let (answers, stream) = mpsc::channel(AHEAD);
-        tokio::spawn(async move {
-            let sent = chunks::send(messages.into_iter(), &answers, room.taking()).await;
-            drop(room);
-            if let Err(error) = sent {
-                let _gone_is_fine = answers.send(Err(error.into())).await;
-            }
-        });
+        let taking = Arc::clone(room.taking());
+        tokio::spawn(send_result(messages.into_iter(), answers, taking, room));
         Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
     }
 
@@ -433,6 +427,7 @@ impl SceneFlow for Calls {
             return Err(ApiError::HasExpired(job.id).into());
         }
         let first = usize::try_from(asked.first_row).unwrap_or(usize::MAX);
+        let message = |part| proto::DownloadResultResponse { part: Some(part) };
         let (answers, stream) = mpsc::channel(AHEAD);
         if dense::is_dense(&job) {
             let header = convert::dense_header(job.id, &self.service.dense_report(&job)?);
@@ -442,7 +437,8 @@ impl SceneFlow for Calls {
             let pieces = chunks::dense_pieces(cloud, first).map(Part::DenseChunk);
             let parts = std::iter::once(Part::DenseHeader(header)).chain(pieces);
             let taking = Arc::clone(room.taking());
-            tokio::spawn(send_result(parts, answers, taking, (turn, room)));
+            let messages = parts.map(message);
+            tokio::spawn(send_result(messages, answers, taking, (turn, room)));
         } else {
             let answer = self.service.answer(&job).await?;
             let header = Part::Header(convert::header(&answer));
@@ -450,7 +446,7 @@ impl SceneFlow for Calls {
             let parts = std::iter::once(header).chain(pieces);
             let taking = Arc::clone(answer.room.taking());
             drop(answer);
-            tokio::spawn(send_result(parts, answers, taking, ()));
+            tokio::spawn(send_result(parts.map(message), answers, taking, ()));
         }
         Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
     }

@@ -242,7 +242,7 @@ fn submit<'u>(
     let mut encoder = context.encoder();
     for step in 0..iterations {
         let clock = clock.as_ref().filter(|_| step == 0);
-        iterate(&mut encoder, &phases, &program, (step, clock), control)?;
+        iterate(&mut encoder, &phases, &program, step, clock, control)?;
     }
     let status_bytes = (requests.len() * size_of::<Status>()) as u64;
     let loss_bytes = (requests.len() * STEPS * size_of::<f32>()) as u64;
@@ -294,7 +294,8 @@ fn iterate(
     encoder: &mut wgpu::CommandEncoder,
     phases: &Phases<'_>,
     program: &Program,
-    (step, clock): (usize, Option<&Clock>),
+    step: usize,
+    clock: Option<&Clock>,
     control: &dyn Control,
 ) -> Result<(), BackendError> {
     let run = |pass: &mut wgpu::ComputePass<'_>, items: &[Item]| {

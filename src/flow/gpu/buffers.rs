@@ -72,11 +72,12 @@ impl Buffers {
             flows,
             loss_gradients,
             partials,
+            lanes,
+            steps,
+            statuses,
+            losses,
         ] {
             buffer.destroy();
-        }
-        for records in [lanes, steps, statuses, losses] {
-            records.destroy();
         }
     }
 
