@@ -24,7 +24,7 @@ use crate::cost::CostModel;
 use crate::flow::{self, Cost, Ground, Sweep, window};
 use crate::job::{Job, JobId, JobOptions, Kind};
 use crate::payload::StoredCloud;
-use crate::queue::{Idempotency, PairOf, Submission, Submitted};
+use crate::queue::{Idempotency, PairOf, QueueError, Submission, Submitted};
 use crate::storage::{Blob, BlobError, Fsync};
 
 /// A job that was accepted.
@@ -56,6 +56,8 @@ pub(super) struct PendingJob {
     fingerprint: blake3::Hasher,
     /// The write of a cloud to the store that is in progress.
     writing: Option<JoinHandle<Result<(), BlobError>>>,
+    /// Whether the queue has the job, or may have it: its blobs stay. Those without a job are found
+    /// and removed later.
     submitted: bool,
 }
 
@@ -282,9 +284,13 @@ impl PendingJob {
         let durable = self.request.durability == Durability::Durable;
         for _ in 0..TRIES {
             let submitted = self.service.queue.submit(submission.clone()).await;
-            // After an error of the store the job may have been accepted.
-            if matches!(&submitted, Err(error) if error.is_of_the_machine()) {
-                self.submitted = self.service.may_be_queued(self.id).await;
+            match &submitted {
+                // A database that did not answer in time may accept the job later.
+                Err(QueueError::Store(_) | QueueError::Closed) => self.submitted = true,
+                Err(QueueError::Full(_)) => {
+                    self.submitted = self.service.may_be_queued(self.id).await;
+                }
+                _ => {}
             }
             let (mut job, new) = match submitted? {
                 Submitted::New(job) => {

@@ -13,7 +13,7 @@ use url::{Position, Url};
 use crate::api::Service;
 use crate::clock::Timestamp;
 use crate::metrics::Metrics;
-use crate::queue::{Action, Outgoing, Queue, Settled};
+use crate::queue::{Action, MAX_OUTGOING_DELAY, Outgoing, Queue, Settled};
 use crate::remote::Webhooks;
 use crate::storage::Blobs;
 
@@ -39,13 +39,16 @@ const ANSWERS_WITHIN: Duration = Duration::from_secs(2);
 const BUSY_DELAY: Duration = Duration::from_millis(200);
 const SILENT_DELAY: Duration = Duration::from_secs(15);
 
+/// Time between two looks into the outbox that find actions of busy receivers alone and put them off,
+/// and the same where there may be others behind them.
+const BETWEEN_BUSY: Duration = Duration::from_millis(50);
+const BETWEEN_FULL: Duration = Duration::from_millis(5);
+
 /// Maximum time between two looks into the outbox: what other nodes have left is found then.
 const POLL: Duration = Duration::from_secs(2);
 
 /// Delay after the first failure of an action. It doubles with each further one.
 const FIRST_DELAY: Duration = Duration::from_secs(5);
-/// Maximum delay.
-const MAX_DELAY: Duration = Duration::from_secs(2 * 3600);
 /// Number of attempts at a webhook or a delivery: the last one is about a day after the first.
 const MAX_ATTEMPTS: u32 = 20;
 
@@ -69,6 +72,8 @@ impl Outbox {
     pub(super) async fn run(self) {
         let mut receivers = Receivers::default();
         let mut acting = FuturesUnordered::new();
+        // When actions of a busy receiver that were put off are due again.
+        let mut again = Instant::now();
         loop {
             let room = (AT_ONCE - acting.len()) as u32;
             let taken = match room {
@@ -82,20 +87,29 @@ impl Outbox {
                         Vec::new()
                     }),
             };
-            let found = !taken.is_empty();
-            let mut settled = Vec::new();
+            let found = taken.len();
+            let (mut settled, before) = (Vec::new(), acting.len());
             for one in taken {
                 match receivers.begin(&one, Instant::now()) {
                     Ok(receiver) => acting.push(self.act(one, receiver)),
-                    Err(delay) => settled.push((one.number, Settled::NotTried(delay))),
+                    Err(delay) => {
+                        again = Instant::now() + BUSY_DELAY;
+                        settled.push((one.number, Settled::NotTried(delay)));
+                    }
                 }
             }
-            if !found {
-                let soon = tokio::time::timeout(POLL, self.bell.notified());
+            if found == 0 {
+                let put_off = again.saturating_duration_since(Instant::now());
+                let pause = if put_off.is_zero() { POLL } else { put_off };
                 tokio::select! {
                     Some(tried) = acting.next() => settled.push(receivers.end(tried)),
-                    _either = soon => {}
+                    _either = tokio::time::timeout(pause, self.bell.notified()) => {}
                 }
+            } else if acting.len() == before {
+                // All are for receivers that are busy. A full look may have missed others.
+                let is_full = found == room as usize;
+                let pause = if is_full { BETWEEN_FULL } else { BETWEEN_BUSY };
+                tokio::time::sleep(pause).await;
             }
             while let Some(Some(tried)) = acting.next().now_or_never() {
                 settled.push(receivers.end(tried));
@@ -249,7 +263,7 @@ impl Receivers {
 /// The delay after this many failures.
 fn delay(attempts: u32) -> Duration {
     let doubled = FIRST_DELAY.saturating_mul(1 << attempts.saturating_sub(1).min(20));
-    doubled.min(MAX_DELAY)
+    doubled.min(MAX_OUTGOING_DELAY)
 }
 
 #[cfg(test)]
@@ -332,6 +346,6 @@ mod tests {
         let all: Duration = (1..MAX_ATTEMPTS).map(delay).sum();
         let hours = all.as_secs() / 3600;
         assert!((18..30).contains(&hours), "{hours} h");
-        assert_eq!(delay(u32::MAX), MAX_DELAY);
+        assert_eq!(delay(u32::MAX), MAX_OUTGOING_DELAY);
     }
 }

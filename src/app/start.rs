@@ -260,6 +260,7 @@ impl App {
     ///   kind is expected to work ([`Device::may_work`]).
     /// - The thread of the queue has ended.
     /// - The public port has closed.
+    /// - A worker or a background task has panicked.
     ///
     /// # Panics
     /// If it is called again after the public port has closed.
@@ -270,6 +271,8 @@ impl App {
             reason = devices => reason,
             () = queue.ended() => "the queue's thread has ended".to_owned(),
             _ = listener => "the public port has closed".to_owned(),
+            () = a_panic(&mut self.workers) => "a worker has panicked".to_owned(),
+            () = a_panic(&mut self.upkeep) => "a background task has panicked".to_owned(),
         }
     }
 }
@@ -374,6 +377,16 @@ async fn open_listener(
     listener
         .await
         .with_context(|| format!("cannot listen on {address}"))
+}
+
+/// Waits until one of the tasks panics.
+async fn a_panic(tasks: &mut JoinSet<()>) {
+    while let Some(ended) = tasks.join_next().await {
+        if ended.is_err_and(|error| error.is_panic()) {
+            return;
+        }
+    }
+    std::future::pending::<()>().await;
 }
 
 /// Waits until the last device of a kind has worked, is lost, and does not come back.

@@ -309,6 +309,20 @@ async fn a_server_does_not_give_up_while_another_card_is_being_opened_again() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_server_with_a_task_that_has_panicked_is_given_up() {
+    let mut stand = serve(Vec::new(), true).await;
+    let given_up = timeout(Duration::from_millis(100), stand.app.given_up()).await;
+    assert_eq!(given_up.ok(), None);
+    stand
+        .app
+        .upkeep
+        .spawn(async { panic!("a fault of the outbox") });
+    let reason = timeout(PATIENCE, stand.app.given_up()).await;
+    assert_eq!(reason.expect("in time"), "a background task has panicked");
+    stand.app.drain().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_server_whose_port_has_closed_is_given_up() {
     let mut stand = serve(Vec::new(), true).await;
     assert!(

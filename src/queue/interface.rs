@@ -42,7 +42,7 @@ pub trait Queue: Send + Sync {
     async fn submit(&self, submission: Submission) -> Result<Submitted, QueueError>;
 
     /// Makes a job durable and, for a sequence, its pairs. Returns the job. If it has ended, its
-    /// [`QueueOptions::retention`](super::QueueOptions::retention) applies from its end.
+    /// [`QueueOptions::retention`](super::QueueOptions::retention) begins.
     ///
     /// # Errors
     /// [`QueueError::NotFound`] if there is no such job. [`QueueError::GivenUp`] if it is ephemeral

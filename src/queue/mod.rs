@@ -31,7 +31,7 @@ pub use interface::Queue;
 pub use lease::{Lease, LeaseHeartbeat, Signal};
 pub use migration::Migration;
 pub use node::{Capacities, Capacity, Node};
-pub use outgoing::{Action, Outgoing, Settled};
+pub use outgoing::{Action, MAX_OUTGOING_DELAY, Outgoing, Settled};
 pub use postgres::{PostgresOptions, migrate_postgres, open_postgres};
 #[cfg(any(test, feature = "fuzzing"))]
 pub use sqlite::simulation;

@@ -19,6 +19,9 @@ pub struct Outgoing {
     pub action: Action,
 }
 
+/// The longest delay of an action: a longer one is cut where the wall clock is set back.
+pub const MAX_OUTGOING_DELAY: Duration = Duration::from_secs(2 * 3600);
+
 /// What has become of an [`Outgoing`] action.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Settled {

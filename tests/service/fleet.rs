@@ -232,3 +232,36 @@ async fn nodes_know_each_other_and_a_node_without_devices_has_its_jobs_done_by_t
     worker.kill();
     api.until("it knows of its end", || nodes(&api) == [(true, 0)]);
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_job_that_the_database_accepts_after_its_answer_was_given_up_has_its_sweeps() {
+    let Some(farm) = Farm::start("") else { return };
+    let node = farm.node("all");
+    // Its commit takes longer than a caller waits for the database.
+    farm.sql(
+        "CREATE FUNCTION slow() RETURNS trigger AS $$ BEGIN PERFORM pg_sleep(34); RETURN NULL; END $$ \
+         LANGUAGE plpgsql; \
+         CREATE CONSTRAINT TRIGGER slow AFTER INSERT ON jobs DEFERRABLE INITIALLY DEFERRED \
+         FOR EACH ROW WHEN (NEW.idempotency_key = 'late') EXECUTE FUNCTION slow()",
+    );
+    let client = reqwest::Client::new();
+    let send = async || {
+        let request = client
+            .post(node.url("/v1/jobs"))
+            .header("idempotency-key", "late")
+            .multipart(form(small_pair(), &options(0)));
+        request.send().await.expect("an answer")
+    };
+    let refused = send().await;
+    assert!(refused.status().is_server_error(), "{}", refused.status());
+    let began = Instant::now();
+    while farm.sql("SELECT count(*) FROM jobs WHERE idempotency_key = 'late'") != "1" {
+        assert!(began.elapsed() < PATIENCE, "it is not accepted");
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+    let answer = send().await;
+    assert_eq!(answer.status(), StatusCode::OK, "it is a job of its own");
+    let view: Value = answer.json().await.expect("JSON");
+    let id = view["id"].as_str().expect("an id").to_owned();
+    end_undisturbed(&node, &client, &[id]).await;
+}

@@ -72,6 +72,7 @@ macro_rules! queue_contract {
             ended_jobs_are_kept_for_a_while_and_then_forgotten,
             an_ended_job_is_removed_when_its_owner_asks_for_it,
             a_result_that_somebody_waits_to_read_is_kept,
+            a_result_that_is_still_to_be_delivered_is_kept,
             a_pair_is_not_done_again_while_its_sequence_is_being_closed,
             a_sequence_that_is_asked_for_again_repeats_what_a_deadline_stopped_early,
             followers_see_every_state,

@@ -1,6 +1,7 @@
 //! What ended jobs are kept for.
 
 use super::*;
+use crate::queue::outgoing::Settled;
 
 pub(crate) async fn a_result_that_somebody_waits_to_read_is_kept(stand: &mut impl Stand) {
     let retention = Duration::from_millis(600);
@@ -27,6 +28,39 @@ pub(crate) async fn a_result_that_somebody_waits_to_read_is_kept(stand: &mut imp
     assert_eq!(state(&queue, &kept).await, State::Succeeded);
     let gone = queue.job(&left.tenant, left.id).await;
     assert_eq!(gone.map(drop), Err(QueueError::NotFound));
+}
+
+pub(crate) async fn a_result_that_is_still_to_be_delivered_is_kept(stand: &mut impl Stand) {
+    let retention = Duration::from_millis(300);
+    let options = QueueOptions {
+        retention,
+        answered_retention: retention,
+        ..QueueOptions::default()
+    };
+    let (queue, _events) = stand.open(options).await;
+    let delivered = Submission {
+        result_uri: Some("s3://a/{index}.npz".to_owned()),
+        ..sequence(1)
+    };
+    let whole = submit(&queue, delivered).await;
+    let held = lease(&queue).await;
+    finish(&queue, &held.job, done()).await;
+    let hold = Duration::from_secs(60);
+    let taken = queue.take_outgoing(10, hold).await.expect("taken");
+    assert_eq!(taken.len(), 1, "{taken:?}");
+    // The bucket is away for longer than the retention.
+    let again = vec![(taken[0].number, Settled::Again(hold))];
+    queue.settle(again).await.expect("settled");
+    tokio::time::sleep(retention * 4).await;
+    assert_eq!(state(&queue, &whole).await, State::Succeeded);
+    let done = vec![(taken[0].number, Settled::Done)];
+    queue.settle(done).await.expect("settled");
+    let forgotten = async {
+        while queue.known(vec![whole.id]).await != Ok(Vec::new()) {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    };
+    timeout(PATIENCE, forgotten).await.expect("in time");
 }
 
 pub(crate) async fn a_pair_is_not_done_again_while_its_sequence_is_being_closed(

@@ -8,7 +8,8 @@ use std::time::{Duration, Instant};
 use serde::{Deserialize, Serialize};
 
 use super::locks::COUNT;
-use super::session::{Flush, Session};
+use super::session::{Call, Flush, Session};
+use crate::clock::Timestamp;
 use crate::job::{DeviceKind, Priority};
 use crate::queue::backlog::{Backlog, BacklogKey, Load};
 use crate::queue::effects::Effects;
@@ -20,6 +21,13 @@ use crate::sync::locked;
 
 /// Minimum time between two counts.
 pub(super) const INTERVAL: Duration = Duration::from_secs(1);
+
+/// Number of commits that are remembered until a count has seen them. The next count sees those before
+/// them.
+const UNSEEN: usize = 20_000;
+
+/// Time since the last count after which no node was there, or counts take long.
+const LATELY_MS: i64 = 3000;
 
 /// The transactions that a count has seen, in the form of `pg_current_snapshot()`.
 #[derive(Debug, Default, PartialEq, Eq)]
@@ -69,12 +77,18 @@ impl Ledger {
             return;
         }
         effects.change(&mut locked(&local.backlog));
+        if unseen.commits.len() >= UNSEEN {
+            unseen.commits.pop_front();
+        }
         unseen.commits.push_back((transaction, effects.of_load()));
     }
 
     /// Replaces the backlog by a count and the commits that it has not seen.
     fn counted(&self, local: &Local, snapshot: Snapshot, mut counted: Backlog) {
         let mut unseen = locked(&self.0);
+        if snapshot == unseen.last {
+            return;
+        }
         unseen.commits.retain(|(transaction, effects)| {
             let is_new = !snapshot.has_seen(*transaction);
             if is_new {
@@ -95,8 +109,7 @@ pub(super) fn refresh(
     local: &Local,
     at_once: bool,
 ) -> Result<(), QueueError> {
-    let began = Instant::now();
-    let commit = session.transact(Flush::Never, began, |sql, _: &mut Effects| {
+    let commit = session.transact(Flush::Never, Call::own(), |sql, _: &mut Effects| {
         count_if_old(sql, at_once)?;
         sql.only("SELECT snapshot, load FROM summary", &[])
     })?;
@@ -108,6 +121,16 @@ pub(super) fn refresh(
         ledger.counted(local, snapshot, load);
     }
     Ok(())
+}
+
+/// Whether a node has counted the load a moment ago. Otherwise all have ended, or were cut off from the
+/// database.
+pub(super) fn was_counted_lately(session: &mut Session) -> Result<bool, QueueError> {
+    session.read(Instant::now(), |sql| {
+        let load: String = sql.only("SELECT load FROM summary", &[])?.get(0)?;
+        let at = serde_json::from_str(&load).map_or(0, |load: Summary| load.at);
+        Ok(sql.now().as_millis() - at < LATELY_MS)
+    })
 }
 
 fn count_if_old(sql: &dyn Sql, at_once: bool) -> Result<(), QueueError> {
@@ -134,7 +157,7 @@ fn count_if_old(sql: &dyn Sql, at_once: bool) -> Result<(), QueueError> {
         None => return Ok(()),
     };
     rows.retain(|row| row.get::<Option<u32>>(0) != Ok(None));
-    let summary = Summary::of(&lists::backlog_of(&rows)?);
+    let summary = Summary::of(&lists::backlog_of(&rows)?, sql.now());
     let load =
         serde_json::to_string(&summary).map_err(|error| QueueError::Store(error.to_string()))?;
     let next = sql.now().after(INTERVAL.max(began.elapsed() * 20));
@@ -148,19 +171,23 @@ fn count_if_old(sql: &dyn Sql, at_once: bool) -> Result<(), QueueError> {
 /// The load as it is stored: seconds and jobs.
 #[derive(Debug, Serialize, Deserialize)]
 struct Summary {
+    /// When it was counted, milliseconds since 1970; 0 where an older node did.
+    #[serde(default)]
+    at: i64,
     running: (u64, f64),
     /// Tenant, priority, device kind, jobs, seconds.
     queued: Vec<(String, Priority, Option<DeviceKind>, u64, f64)>,
 }
 
 impl Summary {
-    fn of(backlog: &Backlog) -> Self {
+    fn of(backlog: &Backlog, at: Timestamp) -> Self {
         let running = backlog.running();
         let queued = backlog.queued_loads().map(|(key, load)| {
             let tenant = key.tenant.as_str().to_owned();
             (tenant, key.priority, key.device, load.jobs, load.seconds)
         });
         Self {
+            at: at.as_millis(),
             running: (running.jobs, running.seconds),
             queued: queued.collect(),
         }
@@ -186,6 +213,19 @@ impl Summary {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn commits_that_no_count_has_seen_do_not_pile_up() {
+        let (events, _heard) = tokio::sync::mpsc::unbounded_channel();
+        let (ledger, local) = (Ledger::default(), Local::new(events));
+        for transaction in 0..UNSEEN as u64 + 10 {
+            ledger.add(&local, &Effects::default(), Some(transaction));
+        }
+        let unseen = locked(&ledger.0);
+        let kept = [unseen.commits.front(), unseen.commits.back()];
+        let kept = kept.map(|of| of.map(|(transaction, _)| *transaction));
+        assert_eq!(kept, [Some(10), Some(UNSEEN as u64 + 9)]);
+    }
 
     #[test]
     fn a_snapshot_has_seen_what_had_ended_before_it() {

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use async_trait::async_trait;
 use tokio::sync::{mpsc, oneshot, watch};
@@ -13,7 +13,7 @@ use super::nodes;
 use super::pool::{Pool, spawn};
 use super::presence::Presence;
 use super::schema;
-use super::session::{Flush, Session};
+use super::session::{Call, Flush, Session};
 use super::shared::Shared;
 use super::target::{PostgresOptions, Target};
 use super::this_node::ThisNode;
@@ -40,7 +40,9 @@ const POLL_INTERVAL: Duration = Duration::from_secs(1);
 /// Every change, leases included, is on the database's disk before it is acknowledged; heartbeats
 /// are not. A change waits up to 10 s for a database that is away, so that a restart of it is not
 /// seen. Jobs of nodes that have ended are recovered within 2 s, as [`open_sqlite`] recovers those
-/// of the process before; a node that is stopped but not ended loses them when its leases expire.
+/// of the process before. In the first 8 s of the database or of its connection to it a node recovers
+/// none, unless it is the only one. A node that is stopped but not ended loses its jobs when their
+/// leases expire.
 ///
 /// [`open_sqlite`]: crate::queue::open_sqlite
 ///
@@ -154,8 +156,9 @@ impl Engine for PostgresEngine {
             Kept::Soon => Flush::IfWritten,
         };
         let shared = Arc::clone(&self.shared);
-        let work =
-            move |session: &mut Session, at: Instant| shared.change(session, flush, at, change);
+        let work = move |session: &mut Session, call: Call<'_>| {
+            shared.change(session, flush, call, change)
+        };
         self.pool.run(work).await
     }
 
@@ -164,7 +167,7 @@ impl Engine for PostgresEngine {
         T: Send + 'static,
         C: Fn(&dyn Sql) -> Result<T, QueueError> + Send + 'static,
     {
-        let work = move |session: &mut Session, at: Instant| session.read(at, query);
+        let work = move |session: &mut Session, call: Call<'_>| session.read(call.at, query);
         self.pool.run(work).await
     }
 

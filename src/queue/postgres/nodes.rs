@@ -2,8 +2,8 @@
 
 use std::time::{Duration, Instant};
 
-use super::locks::NODES;
-use super::session::{Flush, Session};
+use super::locks::{BURIALS, NODES};
+use super::session::{Call, Flush, Session};
 use super::shared::Shared;
 use super::this_node::ThisNode;
 use crate::queue::effects::Effects;
@@ -12,21 +12,12 @@ use crate::queue::sql::{Row, Sql, values};
 use crate::queue::transitions::expiry;
 use crate::queue::types::QueueError;
 
-/// After a start of the database, and after this node was cut off from it, the other nodes need
-/// this long to show that they are alive.
-const GRACE: Duration = Duration::from_secs(2);
+/// The other nodes need this long to show that they are alive, as all may have been cut off: a
+/// connection to a database of two addresses takes more than the 5 s for which the first one is tried.
+pub(super) const GRACE: Duration = Duration::from_secs(8);
 
-/// The same if all nodes may have been cut off: a connection to a database of two addresses takes more
-/// than the 5 s for which the first one is tried.
-const GRACE_AFTER_A_CUT: Duration = Duration::from_secs(8);
-
-/// The time that the other nodes need from the opening of this session on.
-pub(super) fn grace(session: &Session) -> Duration {
-    match session.opens() {
-        0 | 1 => GRACE,
-        _ => GRACE_AFTER_A_CUT,
-    }
-}
+/// The same for a node that comes when others were there a moment ago, and none is.
+pub(super) const GRACE_AFTER_AN_END: Duration = Duration::from_secs(2);
 
 /// A node without its lock is dead when it was so at two looks with this time between them.
 pub(super) const SECOND_LOOK: Duration = Duration::from_millis(600);
@@ -109,7 +100,7 @@ pub(super) fn exchange(sql: &dyn Sql, own: Capacities) -> Result<Vec<Node>, Queu
 pub(super) struct Silent {
     pub(super) node: i64,
     /// Whether it said that it stops.
-    stopped: bool,
+    pub(super) stopped: bool,
 }
 
 /// The other nodes as far as their locks tell.
@@ -155,8 +146,31 @@ pub(super) fn look(session: &mut Session, me: i64) -> Result<Look, QueueError> {
     })
 }
 
-/// Recovers the jobs of a dead node and forgets the node. Several nodes may do so at once.
+/// Recovers the jobs of a dead node and forgets the node, unless another node does.
 pub(super) fn bury(session: &mut Session, dead: Silent, shared: &Shared) -> Result<(), QueueError> {
+    let turn = |session: &mut Session, function: &str| {
+        let text = format!("SELECT {function}({BURIALS}, ?1::integer)");
+        let row = session.read(Instant::now(), |sql| sql.only(&text, values![dead.node]))?;
+        row.get::<bool>(0)
+    };
+    // It ends with the connection, so that another node goes on if this one is killed.
+    if !turn(session, "pg_try_advisory_lock")? {
+        return Ok(());
+    }
+    tracing::warn!(
+        node = dead.node,
+        "a node has ended: its jobs are queued again"
+    );
+    let buried = recover_and_forget(session, dead, shared);
+    turn(session, "pg_advisory_unlock")?;
+    buried
+}
+
+fn recover_and_forget(
+    session: &mut Session,
+    dead: Silent,
+    shared: &Shared,
+) -> Result<(), QueueError> {
     let Silent { node, stopped } = dead;
     // From now on it claims nothing under this number.
     let mark = "UPDATE nodes SET stopped = ?2 WHERE id = ?1 AND stopped = 0";
@@ -166,7 +180,7 @@ pub(super) fn bury(session: &mut Session, dead: Silent, shared: &Shared) -> Resu
         let recover = |sql: &dyn Sql, effects: &mut Effects| {
             expiry::recover(sql, effects, &shared.options, id, node, stopped)
         };
-        shared.change(session, Flush::Always, Instant::now(), recover)?;
+        shared.change(session, Flush::Always, Call::own(), recover)?;
     }
     let forget = "DELETE FROM nodes WHERE id = ?1";
     session.read(Instant::now(), |sql| sql.query(forget, values![node]))?;

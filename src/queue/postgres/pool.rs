@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use tokio::sync::oneshot;
 use tokio_util::sync::CancellationToken;
 
-use super::session::{PATIENCE, Session};
+use super::session::{Call, PATIENCE, Session};
 use crate::queue::types::QueueError;
 use crate::sync::locked;
 
@@ -41,10 +41,10 @@ impl Pool {
         Ok(Self { work })
     }
 
-    /// Has one of the threads do something, and waits for it. `at` is the time of the call.
+    /// Has one of the threads do something, and waits for it.
     pub(super) async fn run<T: Send + 'static>(
         &self,
-        work: impl FnOnce(&mut Session, Instant) -> Result<T, QueueError> + Send + 'static,
+        work: impl FnOnce(&mut Session, Call<'_>) -> Result<T, QueueError> + Send + 'static,
     ) -> Result<T, QueueError> {
         let (answer, answered) = oneshot::channel();
         let at = Instant::now();
@@ -55,7 +55,11 @@ impl Pool {
             // The call has waited behind others while the database was away.
             let done = match at.elapsed() > PATIENCE && !session.is_open() {
                 true => Err(QueueError::Store(SILENT.to_owned())),
-                false => work(session, at),
+                false => {
+                    let has_left = || answer.is_closed();
+                    let has_left = &has_left;
+                    work(session, Call { at, has_left })
+                }
             };
             let _gone_is_fine = answer.send(done);
         });

@@ -10,7 +10,7 @@ use postgres::fallible_iterator::FallibleIterator;
 
 use super::backlog;
 use super::bell::Changes;
-use super::nodes::{SECOND_LOOK, Silent, bury, grace, look, show};
+use super::nodes::{GRACE, GRACE_AFTER_AN_END, SECOND_LOOK, Silent, bury, look, show};
 use super::session::Session;
 use super::shared::Shared;
 use super::statements::refused;
@@ -53,6 +53,10 @@ impl Presence {
     /// Shows the node, recovers the jobs of nodes that have ended, and counts the load. The queue
     /// is then ready for use.
     pub(super) fn open(&mut self) -> Result<(), QueueError> {
+        let grace = match backlog::was_counted_lately(&mut self.session)? {
+            true => GRACE_AFTER_AN_END,
+            false => GRACE,
+        };
         self.show()?;
         loop {
             let node = self.shared.node();
@@ -63,11 +67,10 @@ impl Presence {
             }
             thread::sleep(SECOND_LOOK);
             let second = look(&mut self.session, node)?;
-            if second.is_young || self.session.age() < grace(&self.session) {
-                continue;
-            }
+            let is_early = second.is_young || self.session.age() < grace;
             for dead in second.silent {
-                if first.silent.contains(&dead) {
+                // One that said that it stops does not come back.
+                if first.silent.contains(&dead) && (dead.stopped || !is_early) {
                     bury(&mut self.session, dead, &self.shared)?;
                 }
             }
@@ -152,16 +155,12 @@ impl Presence {
     fn look_for_the_dead(&mut self) -> Result<(), QueueError> {
         let look = look(&mut self.session, self.shared.node())?;
         self.shared.nodes.store(look.alive + 1, Ordering::Relaxed);
-        if look.is_young || self.session.age() < grace(&self.session) {
+        if look.is_young || self.session.age() < GRACE {
             return Ok(());
         }
         let now = look.silent;
         let before = std::mem::replace(&mut self.suspects, now.clone());
         for dead in now.into_iter().filter(|node| before.contains(node)) {
-            tracing::warn!(
-                node = dead.node,
-                "a node has ended: its jobs are queued again"
-            );
             bury(&mut self.session, dead, &self.shared)?;
         }
         Ok(())

@@ -1,9 +1,7 @@
 //! The tables, their indexes, and the check of the schema version.
 
-use std::time::Instant;
-
 use super::locks::SCHEMA;
-use super::session::{Flush, Session};
+use super::session::{Call, Flush, Session};
 use crate::queue::database::new_identity;
 use crate::queue::effects::Effects;
 use crate::queue::migration::Migration;
@@ -11,7 +9,7 @@ use crate::queue::sql::{Sql, values};
 use crate::queue::types::QueueError;
 
 /// The schema version that this program reads and writes.
-const VERSION: i64 = 4;
+const VERSION: i64 = 5;
 
 /// The oldest schema version that is upgraded.
 const OLDEST: i64 = 2;
@@ -28,6 +26,7 @@ const UPGRADES: [&[&str]; (VERSION - OLDEST) as usize] = [
         "ALTER TABLE jobs ADD COLUMN result_uri text, ADD COLUMN delivery smallint",
         OUTBOX_JOB,
     ],
+    &[OPEN_DUE],
 ];
 
 const OUTBOX: &str = "CREATE TABLE outbox (
@@ -41,6 +40,8 @@ const OUTBOX: &str = "CREATE TABLE outbox (
 
 const OUTBOX_DUE: &str = "CREATE INDEX outbox_due ON outbox (due)";
 const OUTBOX_JOB: &str = "CREATE INDEX outbox_job ON outbox (job)";
+const OPEN_DUE: &str =
+    "CREATE INDEX jobs_open_due ON jobs (due) WHERE due IS NOT NULL AND state < 2";
 
 /// `jobs` has the columns of the embedded queue, with the same meanings. Rows change often, so
 /// pages keep room for new versions of a row, and the table is vacuumed early.
@@ -51,7 +52,7 @@ const OUTBOX_JOB: &str = "CREATE INDEX outbox_job ON outbox (job)";
 /// row for each action outside the database that a commit has promised: a notice to `url`, without a
 /// `body` the delivery of the job's result to it, and without a `url` the removal of the job's files.
 /// `summary` has one row, the last count of the load.
-const TABLES: [&str; 22] = [
+const TABLES: [&str; 23] = [
     "CREATE TABLE meta (version bigint NOT NULL, identity bigint NOT NULL)",
     "CREATE TABLE nodes (
         id integer GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
@@ -155,6 +156,7 @@ const TABLES: [&str; 22] = [
     OUTBOX,
     OUTBOX_DUE,
     OUTBOX_JOB,
+    OPEN_DUE,
 ];
 
 /// A database with the tables of this program's version.
@@ -169,7 +171,7 @@ pub(super) struct Prepared {
 /// Creates the tables in an empty database, or upgrades those of an older version.
 pub(super) fn prepare(session: &mut Session) -> Result<Prepared, QueueError> {
     let identity = new_identity();
-    let commit = session.transact(Flush::Always, Instant::now(), |sql, _: &mut Effects| {
+    let commit = session.transact(Flush::Always, Call::own(), |sql, _: &mut Effects| {
         create(sql, identity)
     })?;
     Ok(commit.value)

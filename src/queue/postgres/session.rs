@@ -37,6 +37,35 @@ pub(super) enum Flush {
     Never,
 }
 
+/// A call of a change: when it was made, and whether its caller has left meanwhile.
+#[derive(Clone, Copy)]
+pub(super) struct Call<'a> {
+    pub(super) at: Instant,
+    pub(super) has_left: &'a dyn Fn() -> bool,
+}
+
+impl Call<'_> {
+    /// A call of the thread that makes the change, which does not leave.
+    pub(super) fn own() -> Self {
+        Self {
+            at: Instant::now(),
+            has_left: &|| false,
+        }
+    }
+
+    fn is_late(&self) -> bool {
+        self.at.elapsed() > PATIENCE
+    }
+
+    /// An error if the caller has left: it was told that the change failed.
+    fn check(&self) -> Result<(), QueueError> {
+        match (self.has_left)() {
+            true => Err(QueueError::Store("the caller has left".to_owned())),
+            false => Ok(()),
+        }
+    }
+}
+
 /// A change that was committed.
 pub(super) struct Commit<T> {
     pub(super) value: T,
@@ -138,24 +167,24 @@ impl Session {
     }
 
     /// Makes a change in a transaction. While the database is away it is tried again, until
-    /// [`PATIENCE`] has passed since `asked`. If the answer to the commit is lost, another connection
-    /// asks whether the transaction was committed.
+    /// [`PATIENCE`] has passed since the call. If the answer to the commit is lost, another connection
+    /// asks whether the transaction was committed. A change whose caller has left is rolled back.
     pub(super) fn transact<T>(
         &mut self,
         flush: Flush,
-        asked: Instant,
+        call: Call<'_>,
         change: impl Fn(&dyn Sql, &mut Effects) -> Result<T, QueueError>,
     ) -> Result<Commit<T>, QueueError> {
         let mut conflicts = 0;
         loop {
             let mut made = None;
-            let failed = self.attempt(flush, &change, &mut made).err();
+            let failed = self.attempt(flush, call, &change, &mut made).err();
             let error = match failed {
                 None => return made.ok_or(QueueError::Closed),
                 Some(Failed::Refused(error)) => return Err(error),
                 Some(Failed::Again(Fault::Conflict, error)) => {
                     conflicts += 1;
-                    if conflicts > MAX_CONFLICTS || asked.elapsed() > PATIENCE {
+                    if conflicts > MAX_CONFLICTS || call.is_late() {
                         return Err(error);
                     }
                     continue;
@@ -166,14 +195,14 @@ impl Session {
                 }
                 Some(Failed::Unknown(token, error)) => {
                     self.close();
-                    match token.map(|token| self.was_committed(token, asked)) {
+                    match token.map(|token| self.was_committed(token, call.at)) {
                         Some(Ok(true)) => return made.ok_or(error),
                         Some(Ok(false)) | None => error,
                         Some(Err(_)) => return Err(error),
                     }
                 }
             };
-            if asked.elapsed() > PATIENCE {
+            if call.is_late() {
                 return Err(error);
             }
             thread::sleep(PAUSE);
@@ -184,6 +213,7 @@ impl Session {
     fn attempt<T>(
         &mut self,
         flush: Flush,
+        call: Call<'_>,
         change: impl Fn(&dyn Sql, &mut Effects) -> Result<T, QueueError>,
         made: &mut Option<Commit<T>>,
     ) -> Result<(), Failed> {
@@ -204,6 +234,7 @@ impl Session {
                 transaction = number.parse().ok();
                 token = Some(Token { node, count });
             }
+            call.check()?;
             Ok((value, transaction))
         });
         let (value, transaction) = match (done, sql.fault()) {

@@ -2,12 +2,11 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
-use std::time::Instant;
 
 use super::backlog::Ledger;
 use super::beats::Beats;
 use super::bell::{Bell, Changes};
-use super::session::{Flush, Session};
+use super::session::{Call, Flush, Session};
 use super::this_node::ThisNode;
 use crate::queue::effects::Effects;
 use crate::queue::local::Local;
@@ -68,10 +67,10 @@ impl Shared {
         &self,
         session: &mut Session,
         flush: Flush,
-        asked: Instant,
+        call: Call<'_>,
         change: impl Fn(&dyn Sql, &mut Effects) -> Result<T, QueueError>,
     ) -> Result<T, QueueError> {
-        let commit = session.transact(flush, asked, change)?;
+        let commit = session.transact(flush, call, change)?;
         self.committed(commit.effects, commit.transaction);
         Ok(commit.value)
     }

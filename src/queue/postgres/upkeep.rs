@@ -8,9 +8,9 @@ use std::time::{Duration, Instant};
 
 use super::bell::Changes;
 use super::locks::SWEEP;
-use super::nodes::grace;
+use super::nodes::GRACE;
 use super::presence::CHANNEL;
-use super::session::{Flush, Session};
+use super::session::{Call, Flush, Session};
 use super::shared::Shared;
 use crate::job::JobId;
 use crate::queue::effects::Effects;
@@ -35,6 +35,9 @@ const FEW_NODES: u32 = 4;
 /// How long rows that are due are handled in one turn.
 const AT_A_TIME: Duration = Duration::from_millis(50);
 
+/// Number of ended jobs that are forgotten in one transaction. Each waits for the disk.
+const FORGOTTEN_AT_ONCE: usize = 64;
+
 /// Time after which a claimed job is given back that no worker took.
 const NOT_TAKEN: Duration = Duration::from_secs(2);
 
@@ -47,6 +50,19 @@ const BEAT_INTERVAL: Duration = Duration::from_secs(1);
 /// The pause after an error.
 const PAUSE: Duration = Duration::from_millis(200);
 
+/// A turn takes less while the database answers.
+const LONGEST_TURN: Duration = Duration::from_secs(2);
+
+/// How many of the jobs that were due are handled.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Handled {
+    All,
+    /// The rest is due still.
+    InPart,
+    /// None: another node is at it.
+    ByAnotherNode,
+}
+
 /// The upkeep of a node, on its own connection.
 pub(super) struct Upkeep {
     shared: Arc<Shared>,
@@ -57,6 +73,12 @@ pub(super) struct Upkeep {
     beaten: Instant,
     /// Whether rows are due that the last turn had no time for.
     is_behind: bool,
+    /// When the rows that are due were last read, and when the last pause ended in which they were not.
+    seen: Instant,
+    awake_since: Instant,
+    /// Whether a row that was due could not be handled. Each is then handled for itself, so that it does
+    /// not keep the others from it.
+    has_failed: bool,
 }
 
 impl Upkeep {
@@ -70,6 +92,9 @@ impl Upkeep {
             read: now,
             beaten: now,
             is_behind: false,
+            seen: now,
+            awake_since: now,
+            has_failed: false,
         }
     }
 
@@ -148,7 +173,7 @@ impl Upkeep {
                 }
                 Ok(())
             };
-            self.session.transact(Flush::Never, Instant::now(), renew)?;
+            self.session.transact(Flush::Never, Call::own(), renew)?;
         }
         self.shared.beats.written();
         Ok(())
@@ -196,7 +221,7 @@ impl Upkeep {
             };
             let session = &mut self.session;
             self.shared
-                .change(session, Flush::IfWritten, Instant::now(), release)?;
+                .change(session, Flush::IfWritten, Call::own(), release)?;
         }
         Ok(())
     }
@@ -205,40 +230,65 @@ impl Upkeep {
     /// cancellations are not to wait.
     fn handle_what_is_due(&mut self) -> Result<(), QueueError> {
         let due = self.session.read(Instant::now(), expiry::due)?;
-        // While nobody could reach the database, nobody could renew a lease.
-        let grace = grace(&self.session).min(self.shared.options.lease);
-        let may_expire = self.session.age() >= grace;
-        let options = &self.shared.options;
-        let lock = format!("SELECT pg_try_advisory_xact_lock({SWEEP}, 0)");
+        // A database that hung, or a pause of this process: leases were not renewed meanwhile.
+        if self.seen.elapsed() > LONGEST_TURN + self.shared.options.lease / 2 {
+            self.awake_since = Instant::now();
+        }
+        self.seen = Instant::now();
+        let at_once = match std::mem::take(&mut self.has_failed) {
+            true => 1,
+            false => FORGOTTEN_AT_ONCE,
+        };
         let began = Instant::now();
-        self.is_behind = false;
-        for id in due {
+        self.is_behind = due.has_more;
+        for jobs in due.open.chunks(1).chain(due.ended.chunks(at_once)) {
             if began.elapsed() > AT_A_TIME {
                 self.is_behind = true;
                 break;
             }
-            let look = |sql: &dyn Sql, effects: &mut Effects| {
-                if !sql.only(&lock, &[])?.get::<bool>(0)? {
-                    return Ok(false);
+            match self.look_after(jobs) {
+                Ok(Handled::All) => {}
+                Ok(Handled::InPart) => {
+                    self.is_behind = true;
+                    break;
                 }
-                let left = (!may_expire).then_some(grace);
-                expiry::look_after(sql, effects, options, id, left)?;
-                Ok(true)
-            };
-            let session = &mut self.session;
-            match self
-                .shared
-                .change(session, Flush::Always, Instant::now(), look)
-            {
-                Ok(true) => {}
-                // Another node handles what is due.
-                Ok(false) => break,
-                // It does not keep the others from being handled.
+                Ok(Handled::ByAnotherNode) => {
+                    self.is_behind = false;
+                    break;
+                }
                 Err(error) => {
-                    tracing::error!(%error, job = %id, "a job that is due is not handled");
+                    self.has_failed = true;
+                    tracing::error!(%error, ?jobs, "jobs that are due are not handled");
                 }
             }
         }
+        self.is_behind &= !self.has_failed;
         Ok(())
+    }
+
+    /// Handles jobs whose rows are due in one transaction, for a moment.
+    fn look_after(&mut self, jobs: &[JobId]) -> Result<Handled, QueueError> {
+        // While nobody could reach the database, nobody could renew a lease.
+        let options = &self.shared.options;
+        let grace = GRACE.min(options.lease);
+        let reached_for = self.session.age().min(self.awake_since.elapsed());
+        let left = (reached_for < grace).then_some(grace);
+        let lock = format!("SELECT pg_try_advisory_xact_lock({SWEEP}, 0)");
+        let look = |sql: &dyn Sql, effects: &mut Effects| {
+            if !sql.only(&lock, &[])?.get::<bool>(0)? {
+                return Ok(Handled::ByAnotherNode);
+            }
+            let began = Instant::now();
+            for (handled, id) in jobs.iter().enumerate() {
+                if handled > 0 && began.elapsed() > AT_A_TIME {
+                    return Ok(Handled::InPart);
+                }
+                expiry::look_after(sql, effects, options, *id, left)?;
+            }
+            Ok(Handled::All)
+        };
+        let session = &mut self.session;
+        self.shared
+            .change(session, Flush::Always, Call::own(), look)
     }
 }

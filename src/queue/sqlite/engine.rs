@@ -26,7 +26,7 @@ use crate::queue::migration::Migration;
 use crate::queue::node::{Capacities, Node};
 use crate::queue::sql::Sql;
 use crate::queue::transitions;
-use crate::queue::transitions::{expiry, lists};
+use crate::queue::transitions::{clock, expiry, lists};
 use crate::queue::types::{Event, QueueError, QueueOptions};
 use crate::sync::locked;
 
@@ -151,6 +151,7 @@ pub(super) fn recover(
     let mut effects = Effects::default();
     connection.execute_batch("BEGIN IMMEDIATE")?;
     let orderly = orderly();
+    clock::bound(&sql, options)?;
     for id in expiry::left_behind(&sql, NODE)? {
         expiry::recover(&sql, &mut effects, options, id, NODE, orderly)?;
     }

@@ -13,7 +13,7 @@ use crate::queue::database::new_identity;
 use crate::queue::types::QueueError;
 
 /// The schema version that this program reads and writes; stored in `user_version`.
-pub(super) const VERSION: i64 = 10;
+pub(super) const VERSION: i64 = 11;
 
 /// The oldest schema version that is upgraded.
 pub(super) const OLDEST: i64 = 8;
@@ -30,6 +30,7 @@ const UPGRADES: [&[&str]; (VERSION - OLDEST) as usize] = [
         "ALTER TABLE jobs ADD COLUMN delivery INTEGER",
         OUTBOX_JOB,
     ],
+    &[OPEN_DUE],
 ];
 
 const OUTBOX: &str = "
@@ -45,6 +46,9 @@ CREATE INDEX outbox_due ON outbox (due);
 ";
 
 const OUTBOX_JOB: &str = "CREATE INDEX outbox_job ON outbox (job);";
+
+const OPEN_DUE: &str =
+    "CREATE INDEX jobs_open_due ON jobs (due) WHERE due IS NOT NULL AND state < 2;";
 
 /// `due` is the next time at which the expiry handles a row: the expiry or the end of the retry
 /// delay of a queued job, the end of a running job's lease, or the end of an ended job's retention.
@@ -168,6 +172,7 @@ pub(super) fn create(connection: &Connection) -> Result<(), QueueError> {
     connection.execute_batch(TABLE)?;
     connection.execute_batch(OUTBOX)?;
     connection.execute_batch(OUTBOX_JOB)?;
+    connection.execute_batch(OPEN_DUE)?;
     Ok(())
 }
 

@@ -99,6 +99,8 @@ fn the_statements_of_the_hot_path_sort_nothing_and_scan_no_table() {
         (fair_queue::LAST_OF_TENANT, 2),
         (expiry::OLDEST, 0),
         (expiry::NEXT_DUE, 0),
+        (expiry::DUE_OPEN, 2),
+        (expiry::DUE_ENDED, 2),
         (outbox::DUE, 2),
         (outbox::UNDELIVERED, 1),
         (outbox::WAKE_NOTICES, 2),
@@ -132,6 +134,27 @@ fn the_statements_of_the_hot_path_sort_nothing_and_scan_no_table() {
             .expect("an answer")
             .is_some()
     );
+}
+
+#[tokio::test]
+async fn jobs_that_somebody_waits_for_are_looked_after_before_those_that_are_forgotten() {
+    const ENDED: usize = 300;
+    let mut folder = Folder::new();
+    let (queue, _heard) = folder.open(QueueOptions::default()).await;
+    for _ in 0..=ENDED {
+        queue.submit(submission("a")).await.expect("accepted");
+    }
+    drop(queue);
+    let path = folder.0.path().join("queue.sqlite3");
+    let connection = schema::open_writer(&path).expect("the file");
+    let late = format!(
+        "UPDATE jobs SET state = 3, due = seq WHERE seq <= {ENDED}; \
+         UPDATE jobs SET due = seq WHERE seq > {ENDED}"
+    );
+    connection.execute_batch(&late).expect("set");
+    let due = expiry::due(&SqliteSql(&connection)).expect("an answer");
+    assert_eq!(due.open.len(), 1);
+    assert!(due.has_more && due.ended.len() < ENDED);
 }
 
 #[tokio::test]

@@ -17,7 +17,7 @@ use crate::queue::effects::Effects;
 use crate::queue::local::Local;
 use crate::queue::sql::Sql;
 use crate::queue::time;
-use crate::queue::transitions::expiry;
+use crate::queue::transitions::{clock, expiry};
 use crate::queue::types::{QueueError, QueueOptions};
 
 /// Maximum number of changes in one transaction.
@@ -25,6 +25,10 @@ const AT_ONCE: usize = 64;
 
 /// Maximum sleep, and so the delay until a change of the wall clock is noticed.
 const MAX_SLEEP: Duration = Duration::from_secs(1);
+
+/// A step of the wall clock that what is due follows, milliseconds. A smaller one is within the
+/// precision of the times of a job.
+const STEP_MS: u64 = 10_000;
 
 /// A change, run inside a transaction.
 type Change = Box<dyn FnOnce(&Connection, &mut Effects) -> Reply + Send>;
@@ -132,31 +136,55 @@ fn in_savepoint<T>(
     done
 }
 
-/// Commits the commands in one transaction and, with `sweep_at`, does what is due at that time.
-/// Returns whether nothing that is due was left undone.
+/// What a turn does besides its commands.
+#[derive(Clone, Copy, Debug, Default)]
+struct Upkeep {
+    /// By how many milliseconds the wall clock was set. What is due moves with it: it would be due at
+    /// once, and results be removed before their time, or not for as long as the clock was set back.
+    clock_step: Option<i64>,
+    /// Does what is due at this time.
+    sweep_at: Option<Instant>,
+}
+
+/// What of a turn was done.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Done {
+    Nothing,
+    /// The commands, and not what is due.
+    Commands,
+    All,
+}
+
+/// Commits the commands and the upkeep in one transaction.
 fn commit(
     connection: &Connection,
     options: &QueueOptions,
     local: &Local,
     commands: Vec<Command>,
-    sweep_at: Option<Instant>,
-) -> bool {
+    upkeep: Upkeep,
+) -> Done {
     let mut effects = Effects::default();
     let mut replies = Vec::with_capacity(commands.len());
     let mut swept = false;
+    let follow = |sql: &dyn Sql| match upkeep.clock_step {
+        None => Ok(()),
+        Some(step) => clock::follow(sql, options, step),
+    };
     let done = transact(
         connection,
+        follow,
         commands,
         &mut effects,
         &mut replies,
         |effects| {
-            let Some(now) = sweep_at else {
+            let Some(now) = upkeep.sweep_at else {
                 swept = true;
                 return;
             };
             let mut own = Effects::default();
             let sweep = |sql: &dyn Sql| {
-                for id in expiry::due(sql)? {
+                let due = expiry::due(sql)?;
+                for id in due.open.into_iter().chain(due.ended) {
                     let left = local.lease_left(id, options.lease, now);
                     expiry::look_after(sql, &mut own, options, id, left)?;
                 }
@@ -182,7 +210,11 @@ fn commit(
     for reply in replies {
         reply(done.clone());
     }
-    swept && done.is_ok()
+    match done {
+        Err(_) => Done::Nothing,
+        Ok(()) if swept => Done::All,
+        Ok(()) => Done::Commands,
+    }
 }
 
 /// The work of the writer thread.
@@ -193,6 +225,8 @@ pub(super) struct Turns {
     next_due: Option<Timestamp>,
     /// When the last turn began.
     awake: Instant,
+    /// Both clocks when they were last compared.
+    clocks: (Timestamp, Instant),
 }
 
 impl Turns {
@@ -204,7 +238,15 @@ impl Turns {
             options,
             local,
             awake: time::monotonic(),
+            clocks: (time::wall(), time::monotonic()),
         }
+    }
+
+    /// By how many milliseconds the wall clock was set since the clocks were last compared.
+    fn clock_step(&self, clocks: (Timestamp, Instant)) -> Option<i64> {
+        let expected = self.clocks.0.after(clocks.1 - self.clocks.1);
+        let step = clocks.0.as_millis() - expected.as_millis();
+        (step.unsigned_abs() >= STEP_MS).then_some(step)
     }
 
     /// The connection, between two turns.
@@ -247,21 +289,33 @@ impl Turns {
             self.local.all_are_alive();
         }
         self.awake = now;
-        let sweeping = self.next_due.is_some_and(|due| due <= time::wall());
-        if commands.is_empty() && !sweeping {
+        let clocks = (time::wall(), now);
+        let clock_step = self.clock_step(clocks);
+        let sweeping = self.next_due.is_some_and(|due| due <= clocks.0);
+        if commands.is_empty() && !sweeping && clock_step.is_none() {
+            self.clocks = clocks;
             return;
         }
-        let swept = commit(
-            &self.connection,
-            &self.options,
-            &self.local,
-            commands,
-            sweeping.then_some(now),
-        );
+        let upkeep = Upkeep {
+            clock_step,
+            sweep_at: sweeping.then_some(now),
+        };
+        let (connection, options) = (&self.connection, &self.options);
+        let done = commit(connection, options, &self.local, commands, upkeep);
+        if clock_step.is_none() || done != Done::Nothing {
+            self.clocks = clocks;
+        }
+        if let Some(milliseconds) = clock_step {
+            tracing::warn!(
+                milliseconds,
+                ?done,
+                "the wall clock was set: what is due moves with it"
+            );
+        }
         // A store that fails is not asked again at once.
         let later = Some(time::wall().after(MAX_SLEEP));
         self.next_due = match expiry::next_due(&SqliteSql(&self.connection)) {
-            Ok(due) if swept => due,
+            Ok(due) if done == Done::All => due,
             Ok(due) => due.max(later),
             Err(error) => {
                 tracing::error!(%error, "the queue's store cannot be read");
@@ -281,9 +335,10 @@ fn check_transaction(connection: &Connection) -> Result<(), QueueError> {
     Ok(())
 }
 
-/// Runs all commands in one transaction.
+/// Runs all commands in one transaction, after `first` and before `sweep`.
 fn transact(
     connection: &Connection,
+    first: impl FnOnce(&dyn Sql) -> Result<(), QueueError>,
     commands: Vec<Command>,
     effects: &mut Effects,
     replies: &mut Vec<Reply>,
@@ -295,6 +350,7 @@ fn transact(
         .prepare_cached(&format!("PRAGMA synchronous = {level}"))?
         .execute([])?;
     connection.prepare_cached("BEGIN IMMEDIATE")?.execute([])?;
+    first(&SqliteSql(connection))?;
     for command in commands {
         replies.push((command.change)(connection, effects));
         check_transaction(connection)?;
@@ -334,6 +390,7 @@ mod tests {
         let mut replies = Vec::new();
         let done = transact(
             &connection,
+            |_| Ok(()),
             commands.into(),
             &mut Effects::default(),
             &mut replies,

@@ -12,8 +12,16 @@ use crate::queue::effects::Effects;
 use crate::queue::sql::{Sql, values};
 use crate::queue::types::{Event, QueueError, QueueOptions};
 
-/// Due rows that one pass handles.
+/// Due rows of each kind that one pass handles.
 const AT_ONCE: u32 = 256;
+
+/// The statement that finds the open jobs whose rows are due. The query plan test also uses it.
+pub(in crate::queue) const DUE_OPEN: &str = "SELECT id FROM jobs INDEXED BY jobs_open_due \
+    WHERE due <= ?1 AND due IS NOT NULL AND state < 2 ORDER BY due LIMIT ?2";
+
+/// The same for the jobs that have ended.
+pub(in crate::queue) const DUE_ENDED: &str = "SELECT id FROM jobs INDEXED BY jobs_due \
+    WHERE due <= ?1 AND state > 1 ORDER BY due LIMIT ?2";
 
 /// The statement that finds the time of the next due row. The query plan test also uses it.
 pub(in crate::queue) const NEXT_DUE: &str =
@@ -25,12 +33,34 @@ pub(in crate::queue) fn next_due(sql: &dyn Sql) -> Result<Option<Timestamp>, Que
 }
 
 /// The jobs whose rows are due, the earliest first.
-pub(in crate::queue) fn due(sql: &dyn Sql) -> Result<Vec<JobId>, QueueError> {
-    let text = format!(
-        "SELECT id FROM jobs INDEXED BY jobs_due WHERE due <= ?1 ORDER BY due LIMIT {AT_ONCE}"
-    );
-    let rows = sql.query(&text, values![sql.now()])?;
-    rows.iter().map(|row| row.get(0)).collect()
+#[derive(Debug)]
+pub(in crate::queue) struct Due {
+    /// Jobs whose lease, retry delay or time in the queue has ended.
+    pub(in crate::queue) open: Vec<JobId>,
+    /// Jobs whose retention has ended. Somebody waits for the open ones, and nobody for these.
+    pub(in crate::queue) ended: Vec<JobId>,
+    /// Whether more of them are due than one pass handles.
+    pub(in crate::queue) has_more: bool,
+}
+
+/// The jobs whose rows are due.
+pub(in crate::queue) fn due(sql: &dyn Sql) -> Result<Due, QueueError> {
+    let find = |text: &str| -> Result<Vec<JobId>, QueueError> {
+        let rows = sql.query(text, values![sql.now(), AT_ONCE])?;
+        rows.iter().map(|row| row.get(0)).collect()
+    };
+    let is_full = |found: &[JobId]| found.len() >= AT_ONCE as usize;
+    let open = find(DUE_OPEN)?;
+    let ended = match is_full(&open) {
+        true => Vec::new(),
+        false => find(DUE_ENDED)?,
+    };
+    let has_more = is_full(&open) || is_full(&ended);
+    Ok(Due {
+        open,
+        ended,
+        has_more,
+    })
 }
 
 /// Handles a job if its row is due. `lease_left` is the remaining lease of a running job by its
@@ -56,6 +86,7 @@ pub(in crate::queue) fn look_after(
             Some(left) => leases::prolong(sql, id, left),
             None => take_back(sql, effects, options, &job),
         },
+        _ if outbox::is_delivering(sql, id)? => put_off(sql, options, id),
         _ => forget_or_keep(sql, effects, options, &job),
     }
 }
@@ -175,10 +206,8 @@ fn forget_or_keep(
 
 /// Removes an ended job and its pairs.
 fn forget(sql: &dyn Sql, effects: &mut Effects, id: JobId) -> Result<(), QueueError> {
-    let pairs = rows::pairs(sql, id)?;
-    for id in pairs.iter().map(|pair| pair.id).chain([id]) {
-        outbox::remove_files(sql, id)?;
-        effects.events.push(Event::Deleted(id));
+    for removed in outbox::remove_files(sql, id)? {
+        effects.events.push(Event::Deleted(removed));
     }
     sql.query("DELETE FROM jobs WHERE parent = ?1", values![id])?;
     sql.query("DELETE FROM jobs WHERE id = ?1", values![id])?;

@@ -267,9 +267,9 @@ pub(in crate::queue) fn make_durable(
         return Err(QueueError::GivenUp);
     }
     let text = "UPDATE jobs SET durable = 1, due = CASE WHEN state > 1 AND parent IS NULL \
-                THEN finished + ?2 ELSE due END WHERE id = ?1 OR parent = ?1";
-    let retention = options.retention.as_millis() as i64;
-    sql.query(text, values![id, retention])?;
+                THEN ?2 ELSE due END WHERE id = ?1 OR parent = ?1";
+    let until = sql.now().after(options.retention);
+    sql.query(text, values![id, until])?;
     let job = Arc::new(rows::get(sql, id)?);
     effects.changed.push(Arc::clone(&job));
     Ok(job)

@@ -31,6 +31,15 @@ const MAX_DELAYS: u32 = 13;
 const FIRST_DELAY: Duration = Duration::from_millis(500);
 const LONGEST_DELAY: Duration = Duration::from_secs(300);
 
+/// How often the delay of a retry doubles at most.
+const MAX_DOUBLINGS: u32 = 10;
+
+/// The longest delay of a job that is queued again.
+pub(super) fn longest_delay(options: &QueueOptions) -> Duration {
+    let retry = options.retry_delay.saturating_mul(1 << MAX_DOUBLINGS);
+    retry.max(LONGEST_DELAY)
+}
+
 /// Sort key of a ready job: the lowest runs first.
 type BacklogKey = (core::cmp::Reverse<i64>, f64, i64);
 
@@ -217,7 +226,7 @@ pub(super) fn fail(
 ) -> Result<State, QueueError> {
     let failures = count(sql, job, "failures")?;
     if error.retryable && failures < options.max_attempts {
-        let doublings = (failures - 1).min(10);
+        let doublings = (failures - 1).min(MAX_DOUBLINGS);
         let delay = options.retry_delay.saturating_mul(1 << doublings);
         return requeue_running(sql, effects, job, delay);
     }

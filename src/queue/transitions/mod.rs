@@ -8,6 +8,7 @@
 //! same sequence runs until the commit. A claim is the exception, and locks only the row that it
 //! takes.
 
+pub(super) mod clock;
 pub(super) mod expiry;
 pub(super) mod fair_queue;
 mod finish;

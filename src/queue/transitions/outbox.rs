@@ -23,6 +23,9 @@ const DELIVERY_HOLDS: u32 = 10;
 /// The least delay of a notice whose job is still delivering its result.
 const NOTICE_DELAY: Duration = Duration::from_millis(500);
 
+/// How often due rows are looked for at once where those that were found are put off.
+const LOOKS: u32 = 16;
+
 /// The statement that finds when the last delivery of a job and of its pairs is due. The query plan test
 /// also uses it.
 pub(in crate::queue) const UNDELIVERED: &str = "SELECT max(due) FROM outbox INDEXED BY outbox_job \
@@ -33,11 +36,16 @@ pub(in crate::queue) const UNDELIVERED: &str = "SELECT max(due) FROM outbox INDE
 /// also uses it.
 pub(in crate::queue) const WAKE_NOTICES: &str = "UPDATE outbox INDEXED BY outbox_job SET due = ?2 \
     WHERE job IN (SELECT ?1 UNION ALL SELECT parent FROM jobs INDEXED BY jobs_id WHERE id = ?1 \
-    AND parent IS NOT NULL) AND body IS NOT NULL AND attempts = 0 AND due > ?2";
+    AND parent IS NOT NULL) AND body IS NOT NULL AND attempts = 0";
 
-/// Promises to remove the files of a job.
-pub(super) fn remove_files(sql: &dyn Sql, id: JobId) -> Result<(), QueueError> {
-    insert(sql, id, None, None)
+/// Promises to remove the files of a job and of its pairs. Returns them.
+pub(super) fn remove_files(sql: &dyn Sql, id: JobId) -> Result<Vec<JobId>, QueueError> {
+    let text = "INSERT INTO outbox (job, due, attempts) SELECT id, ?2, 0 FROM jobs \
+                INDEXED BY jobs_parent WHERE parent = ?1 RETURNING job";
+    let rows = sql.query(text, values![id, sql.now()])?;
+    insert(sql, id, None, None)?;
+    let pairs = rows.iter().map(|row| row.get(0));
+    pairs.chain([Ok(id)]).collect()
 }
 
 /// Promises to deliver the result of a job that has succeeded, if there is a place for it.
@@ -80,13 +88,17 @@ pub(in crate::queue) fn take(
     limit: u32,
     hold: Duration,
 ) -> Result<Vec<Outgoing>, QueueError> {
-    let due = sql.query(
-        &format!("{DUE} FOR UPDATE SKIP LOCKED"),
-        values![sql.now(), i64::from(limit)],
-    )?;
+    let text = format!("{DUE} FOR UPDATE SKIP LOCKED");
     let mut taken = Vec::new();
-    for row in &due {
-        taken.extend(take_row(sql, row, hold)?);
+    for _ in 0..LOOKS {
+        let due = sql.query(&text, values![sql.now(), i64::from(limit)])?;
+        for row in &due {
+            taken.extend(take_row(sql, row, hold)?);
+        }
+        // Of those that were found all may be notices that wait. They are put off by now.
+        if !taken.is_empty() || due.len() < limit as usize {
+            break;
+        }
     }
     Ok(taken)
 }
@@ -126,6 +138,11 @@ fn take_row(sql: &dyn Sql, row: &Row, hold: Duration) -> Result<Option<Outgoing>
         attempts: row.get(0)?,
         action,
     }))
+}
+
+/// Whether the result of a job, or one of its pairs', is still to be delivered.
+pub(super) fn is_delivering(sql: &dyn Sql, job: JobId) -> Result<bool, QueueError> {
+    Ok(delivered_at(sql, job)?.is_some())
 }
 
 /// When the result of a job, or the last result of its pairs, is due to be delivered. `None` if nothing

@@ -6,18 +6,20 @@ use std::time::Duration;
 
 use tokio::sync::mpsc;
 
+mod burials;
 mod nodes;
 mod same_answers;
+mod upkeep;
 
 use super::engine::{migrate_postgres, open_postgres};
 use super::target::PostgresOptions;
-use crate::job::DeviceKind;
+use crate::job::{DeviceKind, JobId};
 use crate::queue::contract_tests::{Stand, queue_contract, submission};
 use crate::queue::interface::Queue;
 use crate::queue::migration::Migration;
 use crate::queue::sql::for_postgres;
 use crate::queue::transitions::{expiry, fair_queue, leases, standing};
-use crate::queue::types::{Event, QueueError, QueueOptions, Submitted};
+use crate::queue::types::{Event, Idempotency, QueueError, QueueOptions, Submission, Submitted};
 
 #[path = "../../../../tests/common/postgres_server.rs"]
 mod postgres_server;
@@ -150,9 +152,12 @@ async fn another_schema_or_program_is_refused_with_what_to_do() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_database_of_an_older_version_is_upgraded_and_keeps_its_jobs() {
     // What turns the tables into those of each older version.
-    const SINCE_3: &str = "ALTER TABLE jobs DROP COLUMN result_uri, DROP COLUMN delivery";
+    const SINCE_4: &str = "DROP INDEX jobs_open_due";
+    const SINCE_3: &str =
+        "DROP INDEX jobs_open_due; ALTER TABLE jobs DROP COLUMN result_uri, DROP COLUMN delivery";
     let since_2 = format!("{SINCE_3}, DROP COLUMN trace, DROP COLUMN webhook; DROP TABLE outbox");
     for (version, change) in [
+        (4, SINCE_4.to_owned()),
         (3, format!("{SINCE_3}; DROP INDEX outbox_job")),
         (2, since_2),
     ] {
@@ -173,12 +178,12 @@ async fn a_database_of_an_older_version_is_upgraded_and_keeps_its_jobs() {
         let migrated = migrate_postgres(&database.options("second")).await;
         let upgrade = Migration {
             from: version,
-            to: 4,
+            to: 5,
         };
         assert_eq!(migrated, Ok(upgrade));
         // A column that is dropped keeps its number.
         assert_eq!([columns, indexes].map(run), fresh);
-        assert_eq!(run("SELECT version FROM meta"), "4");
+        assert_eq!(run("SELECT version FROM meta"), "5");
         let (queue, _heard) = database.node("second", QueueOptions::default()).await;
         let held = queue.lease("worker", DeviceKind::Cpu).await.expect("a job");
         let Submitted::New(job) = job else {
@@ -210,13 +215,27 @@ async fn calls_fail_in_time_while_the_database_hangs_and_work_afterwards() {
         assert!(sent.expect("kill runs").success(), "{pids}");
     };
     send("-STOP");
-    let asked = queue.submit(submission("a"));
+    let keyed = |id| Submission {
+        id,
+        idempotency: Some(Idempotency {
+            key: "key".to_owned(),
+            fingerprint: [1; 32],
+        }),
+        ..submission("a")
+    };
+    let (first, second) = (JobId::fresh(), JobId::fresh());
+    let asked = queue.submit(keyed(first));
     let answer = tokio::time::timeout(Duration::from_secs(60), asked).await;
     send("-CONT");
     let refused = answer.expect("an answer while the database hangs");
     assert!(matches!(refused, Err(QueueError::Store(_))), "{refused:?}");
     let held = queue.lease("worker", DeviceKind::Cpu).await.expect("a job");
     assert_eq!(held.job.id, job.id);
+    // Its caller has left: the database goes on with the change, and it is not committed.
+    tokio::time::sleep(Duration::from_secs(2)).await;
+    assert_eq!(queue.known(vec![first]).await, Ok(Vec::new()));
+    let again = queue.submit(keyed(second)).await;
+    assert!(matches!(again, Ok(Submitted::New(_))), "{again:?}");
 }
 
 #[tokio::test]
@@ -244,6 +263,8 @@ async fn the_statements_of_the_hot_path_use_their_indexes() {
         (fair_queue::LAST_OF_TENANT, "jobs_tail"),
         (expiry::OLDEST, "jobs_age"),
         (expiry::NEXT_DUE, "jobs_due"),
+        (expiry::DUE_OPEN, "jobs_open_due"),
+        (expiry::DUE_ENDED, "jobs_due"),
     ] {
         let parameters = ["'t1'", "1"];
         let mut text = for_postgres(sql);

@@ -14,6 +14,8 @@
 //! [`DatabaseQueue`]: crate::queue::database::DatabaseQueue
 
 mod calls;
+#[cfg(test)]
+mod clock;
 mod engine;
 mod process;
 mod promises;

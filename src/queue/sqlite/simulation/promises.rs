@@ -71,6 +71,8 @@ pub(super) struct Promises {
     ever_ended: HashSet<JobId>,
     /// Jobs whose result is to be delivered, with their sequences.
     undelivered: HashMap<JobId, Option<JobId>>,
+    /// Those of them that ended in the writer's turn: an earlier end may have been told before in it.
+    undelivered_now: HashSet<JobId>,
     forgotten: HashSet<JobId>,
     files_removed: HashSet<JobId>,
     /// Whether the machine has lost its power. Commits that had not reached the disk are lost then.
@@ -262,6 +264,7 @@ impl Promises {
         self.undelivered.remove(&job.id);
         if job.state == State::Succeeded && job.delivery.is_some() {
             self.undelivered.insert(job.id, job.parent);
+            self.undelivered_now.insert(job.id);
         }
         self.ever_ended.insert(job.id);
         if job.webhook.is_some() {
@@ -308,6 +311,7 @@ impl Promises {
         self.before.clone_from(&self.live);
         self.ended_now.clear();
         self.again_now.clear();
+        self.undelivered_now.clear();
     }
 
     /// A worker holds a job, after the events of a turn.
@@ -373,7 +377,8 @@ impl Promises {
                 Action::Deliver(_) => {}
                 Action::Notify { .. } => {
                     let of_job = |(id, parent): (&JobId, &Option<JobId>)| {
-                        *id == action.job || *parent == Some(action.job)
+                        let is_of_it = *id == action.job || *parent == Some(action.job);
+                        is_of_it && !self.undelivered_now.contains(id)
                     };
                     assert!(
                         !self.undelivered.iter().any(of_job),
