@@ -66,7 +66,8 @@ function showFailure(page, error) {
   if (!isRefusal) console.error(error);
   const words = isRefusal ? error.message : `the page broke: ${error.message}`;
   fill(page, el("div", { class: "failure", role: "alert", data: { test: "failure" } }, words));
-  if (error.code === "unauthenticated") askForKey(key() ? "The server does not know this key." : null);
+  // A reader with a share link has no key: the link is void.
+  if (error.code === "unauthenticated" && !isShared()) askForKey(key() ? "The server does not know this key." : null);
 }
 
 /** Asks for the key in a dialog. `complaint` says why. */
@@ -114,6 +115,11 @@ async function start() {
   if (theme) document.documentElement.dataset.theme = theme;
   document.getElementById("theme").addEventListener("click", changeTheme);
   document.getElementById("key").addEventListener("click", () => askForKey(null));
+  // The address names the page that is shown, so the link must not change it.
+  document.querySelector(".skip").addEventListener("click", (event) => {
+    event.preventDefault();
+    document.getElementById("page").focus();
+  });
   addEventListener("hashchange", () => void show());
   addEventListener("unhandledrejection", (event) => {
     if (event.reason instanceof Refusal) {

@@ -62,6 +62,8 @@ export class Scene {
   #described;
   #arrays = new Latest();
   #tracks = null;
+  /** Number of pairs that had ended when the tracks were asked for. */
+  #tracksOf = 0;
   #dense = null;
 
   constructor(path) {
@@ -71,7 +73,13 @@ export class Scene {
   /** Fetches the description again: pairs may have ended since. */
   async refresh() {
     this.#described = await json(this.#path);
-    this.#tracks = null;
+    // The server finds all tracks again for each answer: a running sequence gets them now and then.
+    const ended = this.#ended();
+    if (ended === this.pairs.length || ended >= 1.5 * this.#tracksOf) this.#tracks = null;
+  }
+
+  #ended() {
+    return this.pairs.filter((pair) => pair.state === "succeeded").length;
   }
 
   get name() {
@@ -119,7 +127,10 @@ export class Scene {
 
   /** The tracks of moving objects; an empty list if the job has none. */
   tracks() {
-    this.#tracks ??= this.#loadTracks();
+    if (!this.#tracks) {
+      this.#tracksOf = this.#ended();
+      this.#tracks = this.#loadTracks();
+    }
     return this.#tracks;
   }
 
@@ -137,7 +148,10 @@ export class Scene {
 
   /** The dense cloud. Null if there is none. */
   dense() {
-    this.#dense ??= this.#loadDense();
+    this.#dense ??= this.#loadDense().catch((error) => {
+      this.#dense = null;
+      throw error;
+    });
     return this.#dense;
   }
 

@@ -17,7 +17,7 @@ const LOOK_SECONDS = 3;
 /** Shows the page of the job `id`. */
 export async function jobPage(page, signal, id) {
   const path = `/v1/jobs/${encodeURIComponent(id)}`;
-  const [job, info] = await Promise.all([json(path), json("/v1/info")]);
+  const [job, info] = await Promise.all([json(path, { signal }), json("/v1/info", { signal })]);
   const parts = {
     head: el("div", { class: "job-head" }),
     host: el("div", { class: "viewer", data: { test: "viewer" } }),
@@ -76,7 +76,13 @@ async function showPicture(parts, job, path, signal) {
       parts.drawn = drawn;
     }
   } catch (error) {
-    if (!signal.aborted) fill(parts.host, el("p", { class: "failure", role: "alert" }, error.message));
+    if (signal.aborted) return;
+    if (!parts.viewer) fill(parts.host, el("p", { class: "failure", role: "alert" }, error.message));
+    else {
+      // What is drawn stays.
+      notice(error.message, "bad");
+      setTimeout(() => void showPicture(parts, parts.wanted, path, signal), 1000 * LOOK_SECONDS);
+    }
   } finally {
     parts.isDrawing = false;
   }
@@ -202,7 +208,7 @@ function downloads(job, path, info) {
 async function share(path) {
   const link = await json(`${path}/share`, { method: "POST" });
   const address = new URL(link.path, location.origin).href;
-  const input = el("input", { type: "text", readonly: true, "aria-label": "Link", data: { test: "share-link" } });
+  const input = el("input", { type: "text", readonly: "", "aria-label": "Link", data: { test: "share-link" } });
   input.value = address;
   const words = link.expires_at
     ? `Whoever has this link can look at the job until ${new Date(link.expires_at).toLocaleString()}.`

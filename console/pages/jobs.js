@@ -22,13 +22,18 @@ export async function jobsPage(page, signal) {
   const failure = el("div", { role: "alert" });
   const older = button("Older", () => void turn(state.next), { data: { test: "older" } });
   const newer = button("Newer", () => void turn(null), { data: { test: "newer" } });
+  let asked = 0;
   const load = async () => {
+    const number = (asked += 1);
+    older.disabled = true;
     const query = new URLSearchParams({ limit: String(PAGE) });
     if (state.state) query.set("state", state.state);
     if (state.label) query.set("label", state.label);
     const before = state.before.at(-1);
     if (before) query.set("before", before);
     const { jobs, next } = await json(`/v1/jobs?${query}`, { signal });
+    // Another page was asked for meanwhile.
+    if (number !== asked) return;
     state.next = next;
     older.disabled = next === null;
     newer.disabled = state.before.length === 0;

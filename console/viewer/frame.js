@@ -74,6 +74,11 @@ export class Frame {
     return isCompensated && this.ego ? this.sourceFromTarget : identity();
   }
 
+  /** The color that is drawn where `color` is chosen: the height where the sweep lacks what it needs. */
+  shownColor(color) {
+    return COLORS[color].needs(this) ? color : "height";
+  }
+
   /** Full scale of a motion color, metres. */
   scale(color) {
     if (color !== "residual" && color !== "flow") return null;

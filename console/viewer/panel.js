@@ -96,7 +96,7 @@ export function buildControls(state, scene, changed, actions) {
       option.disabled = frame ? !needs(frame) : false;
       option.title = option.disabled ? why : "";
     }
-    color.value = state.color;
+    color.value = frame?.shownColor(state.color) ?? state.color;
     confidence.value = String(state.confidence);
     confidenceText.textContent = state.confidence.toFixed(2);
     shown.textContent = `${state.pointsDrawn.toLocaleString("en-US")} points`;

@@ -62,7 +62,7 @@ export class Picture {
   color(frame) {
     const { state, camera } = this.viewer;
     const painted = frame.colors({
-      color: state.color,
+      color: frame.shownColor(state.color),
       showsGround: state.ground,
       confidence: state.confidence,
       rest: this.palette.rest,
@@ -144,7 +144,8 @@ export class Picture {
     const shown = (objects ?? []).filter((object) => object.confidence >= state.confidence);
     if (state.layers.tracks && state.hasTracks) addTrajectories(lines, shown, tracks, state.sweep, egoOf);
     if (!state.layers.boxes) return [];
-    const isPicked = (object) => state.picked !== null && state.picked.cluster !== null && state.picked.cluster === object.cluster;
+    const picked = { cluster: null, id: null, ...state.picked };
+    const isPicked = (object) => (picked.id === null ? picked.cluster !== null && picked.cluster === object.cluster : picked.id === object.id);
     return shown.map((object) => {
       addObject(lines, object, frame, state.time, !state.ego, isPicked(object));
       const top = [object.center[0], object.center[1], object.center[2] + object.size[2] / 2];

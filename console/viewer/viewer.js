@@ -43,9 +43,13 @@ export class Viewer {
   #controls;
   #tracks = [];
   #egos = new Map();
-  #asked = 0;
   /** The sweep that was asked for last; it may still be loading. */
   #wanted = 0;
+  /** The load in progress, and whether another one has to follow it. */
+  #showing = null;
+  #isStale = false;
+  /** Whether the playback waits for its next sweep. */
+  #isWaiting = false;
   #isDue = false;
   #playedAt = 0;
   #born = performance.now();
@@ -123,6 +127,8 @@ export class Viewer {
 
   /** Shows what has become available since: flows, tracks, the dense cloud. */
   async reload() {
+    // Without WebGL2 there is a message alone.
+    if (!this.#controls) return;
     if (this.#scene.sweeps > 0) await this.show(this.#wanted);
     await this.#loadRest();
   }
@@ -137,11 +143,29 @@ export class Viewer {
     this.#refresh();
   }
 
-  /** Shows a sweep and the pair that starts at it. */
-  async show(index) {
-    const asked = (this.#asked += 1);
-    const sweep = Math.min(this.#scene.sweeps - 1, Math.max(0, index));
-    this.#wanted = sweep;
+  /**
+   * Shows a sweep and the pair that starts at it. One sweep is loaded at a time, then the one that was
+   * asked for last.
+   *
+   * @returns {Promise<boolean>} Whether it could be loaded.
+   */
+  show(index) {
+    this.#wanted = Math.min(this.#scene.sweeps - 1, Math.max(0, index));
+    this.#isStale = true;
+    this.#showing ??= this.#showWanted().finally(() => (this.#showing = null));
+    return this.#showing;
+  }
+
+  async #showWanted() {
+    let isShown = false;
+    while (this.#isStale && !this.#closing.signal.aborted) {
+      this.#isStale = false;
+      isShown = await this.#showSweep(this.#wanted);
+    }
+    return isShown;
+  }
+
+  async #showSweep(sweep) {
     const isFirst = !this.frame;
     if (isFirst) this.#say("Loading the sweeps …");
     try {
@@ -150,8 +174,9 @@ export class Viewer {
         this.#scene.pair(sweep),
         sweep + 1 < this.#scene.sweeps ? this.#scene.sweep(sweep + 1) : null,
       ]);
-      if (asked !== this.#asked || this.#closing.signal.aborted) return;
+      if (this.#closing.signal.aborted) return false;
       this.frame = new Frame(source, target, pair);
+      if (sweep !== this.state.sweep) this.#unpick();
       this.state.sweep = sweep;
       this.#say("");
       if (isFirst) this.#firstView();
@@ -161,10 +186,18 @@ export class Viewer {
       this.#picture.take(this.frame);
       this.#refresh();
     } catch (error) {
-      if (asked === this.#asked) this.#say(error.message);
-      return;
+      this.#say(error.message);
+      return false;
     }
     this.#prefetch(sweep + 2);
+    return true;
+  }
+
+  /** What was picked in another sweep: an object with an identity is the same one in this sweep. */
+  #unpick() {
+    const id = this.state.picked?.id ?? null;
+    this.state.picked = id === null ? null : { row: null, cluster: null, id };
+    this.card.hidden = true;
   }
 
   /** The height of the ground, and what the first sweep cannot show. */
@@ -197,8 +230,15 @@ export class Viewer {
 
   async #showDense() {
     this.#say("Loading the dense cloud …");
-    const dense = await this.#scene.dense();
-    this.#say("");
+    let dense = null;
+    try {
+      dense = await this.#scene.dense();
+      this.#say("");
+    } catch (error) {
+      this.state.dense = false;
+      this.#say(error.message);
+      this.redraw();
+    }
     if (!dense || this.#closing.signal.aborted) return;
     this.denseFrame ??= new DenseFrame(dense);
     if (!this.frame) {
@@ -217,7 +257,7 @@ export class Viewer {
       this.#picture.color(this.frame);
     }
     const { rest } = this.#picture.palette;
-    const color = state.dense ? state.denseColor : state.color;
+    const color = state.dense ? state.denseColor : (this.frame?.shownColor(state.color) ?? state.color);
     showLegend(this.legend, color, state.dense ? null : this.frame?.scale(color), this.frame?.pair?.dt ?? 0.1, rest);
     this.redraw();
   }
@@ -245,7 +285,7 @@ export class Viewer {
       if (this.#closing.signal.aborted) return;
       this.#advance(now);
       this.#draw();
-      if (this.state.isPlaying) this.redraw();
+      if (this.state.isPlaying && !this.#isWaiting) this.redraw();
     });
   }
 
@@ -262,7 +302,7 @@ export class Viewer {
   /** Moves the time on while it plays. A sequence goes on to its next sweep. */
   #advance(now) {
     const { state } = this;
-    if (!state.isPlaying) return;
+    if (!state.isPlaying || this.#isWaiting) return;
     const passed = Math.min(0.2, (now - this.#playedAt) / 1000);
     this.#playedAt = now;
     const isSequence = this.#scene.sweeps > 2;
@@ -272,12 +312,15 @@ export class Viewer {
     state.time = isSequence ? 0 : state.time % 1;
     if (!isSequence) return;
     const next = (state.sweep + 1) % this.#scene.sweeps;
-    state.isPlaying = false;
-    void this.show(next).then(() => this.#play(true));
+    this.#isWaiting = true;
+    void this.show(next).then((isShown) => {
+      this.#isWaiting = false;
+      this.#play(state.isPlaying && isShown);
+    });
   }
 
   #play(isPlaying) {
-    this.state.isPlaying = isPlaying && !this.state.isStopped;
+    this.state.isPlaying = isPlaying;
     this.#playedAt = performance.now();
     this.redraw();
   }
@@ -292,10 +335,7 @@ export class Viewer {
         this.camera.set(this.camera.name);
         this.redraw();
       },
-      play: () => {
-        this.state.isStopped = this.state.isPlaying;
-        this.#play(!this.state.isPlaying);
-      },
+      play: () => this.#play(!this.state.isPlaying),
       sweep: (sweep) => {
         this.state.time = 0;
         void this.show(sweep);
@@ -340,6 +380,7 @@ export class Viewer {
 
   #clicked(x, y) {
     this.canvas.focus();
+    if (!(this.state.dense ? this.denseFrame : this.frame)) return;
     const pointer = { x, y, width: this.canvas.clientWidth, height: this.canvas.clientHeight };
     const row = pick(this.#picture.pickable(), this.#picture.view, pointer);
     if (row === null) {
@@ -375,8 +416,8 @@ export class Viewer {
       return;
     }
     const cluster = this.frame.pair?.cluster?.[row] ?? -1;
-    this.state.picked = { row, cluster: cluster < 0 ? null : cluster };
     const object = this.objects.find((object) => object.cluster !== null && object.cluster === cluster);
+    this.state.picked = { row, cluster: cluster < 0 ? null : cluster, id: object?.id ?? null };
     const rows = [...rowsOfPoint(this.frame, row), ...(object ? rowsOfObject(object) : [])];
     showCard(this.card, "Point", rows, () => this.#clear());
   }

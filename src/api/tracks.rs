@@ -6,13 +6,17 @@ use std::sync::Arc;
 
 use super::error::ApiError;
 use super::lost::{damaged, lost_or};
-use super::result_budget::Encoded;
+use super::result_budget::{Encoded, ResultReservation};
 use super::service::Service;
 use crate::flow::tracks::{ClusteredSweep, Track, Tracker};
 use crate::formats::write_tracks;
 use crate::job::{Job, Kind, State};
 use crate::payload::{StoredCloud, StoredFlow};
 use crate::storage::Blob;
+
+/// Bytes of a state and of a track in an answer, at most.
+const STATE_BYTES: usize = 400;
+const TRACK_BYTES: usize = 200;
 
 /// The tracks of a sequence as far as its pairs have succeeded.
 #[derive(Debug)]
@@ -64,10 +68,24 @@ impl Service {
         sequence: &Job,
     ) -> Result<(Encoded, usize), ApiError> {
         let SequenceTracks { tracks, pairs } = self.tracks(sequence).await?;
+        let room = self.room_for_tracks(sequence, &tracks).await?;
         let mut text = Vec::new();
         write_tracks(&tracks, &mut text).map_err(ApiError::internal)?;
-        let room = self.answers.room(&sequence.tenant, text.len()).await?;
         Ok((room.hold(text), pairs))
+    }
+
+    /// Memory for an answer with tracks.
+    ///
+    /// # Errors
+    /// [`ApiError::ServerFull`] if there is none in time.
+    pub(super) async fn room_for_tracks(
+        &self,
+        sequence: &Job,
+        tracks: &[Track],
+    ) -> Result<ResultReservation, ApiError> {
+        let states: usize = tracks.iter().map(|track| track.states.len()).sum();
+        let bytes = states * STATE_BYTES + (tracks.len() + 1) * TRACK_BYTES;
+        self.answers.room(&sequence.tenant, bytes).await
     }
 
     /// Adds the source sweep of a pair to the tracker.

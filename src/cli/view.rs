@@ -161,14 +161,11 @@ impl View {
                     points.len()
                 )));
             }
-            let is_npz = path.extension().is_some_and(|ending| ending == "npz");
-            let flow = match is_npz && file.valid.is_some() {
-                // It has the ego motion, too.
-                true => files::read_bytes(path)?.into(),
-                false => encoded(file, points)?,
-            };
+            let ego = file.ego.as_ref().map(matrix_rows);
+            // Its arrays may have any type and order; the page reads those that fnsf writes.
+            let flow = encoded(file, points)?;
             let timed = surroundings.timed(&options, [source, source + 1]);
-            pairs.push(local(source, &timed, None, flow));
+            pairs.push(local(source, &timed, ego, flow));
         }
         Ok(pairs)
     }

@@ -123,6 +123,64 @@ fn sweeps_are_shown_with_the_flow_that_is_estimated_and_their_tracks() {
     }
 }
 
+/// An array as numpy writes it: `kind` of the values, and whether the columns come first.
+fn npy(kind: &str, columns_first: bool, shape: &str, values: &[u8]) -> Vec<u8> {
+    let order = if columns_first { "True" } else { "False" };
+    let head = format!("{{'descr': '{kind}', 'fortran_order': {order}, 'shape': {shape}, }}\n");
+    let length = u16::try_from(head.len()).expect("a short head");
+    let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
+    bytes.extend(length.to_le_bytes());
+    bytes.extend(head.as_bytes());
+    bytes.extend(values);
+    bytes
+}
+
+#[test]
+fn a_flow_of_doubles_in_columns_is_served_in_the_form_that_the_page_reads() {
+    let folder = tempfile::tempdir().expect("a folder");
+    street(folder.path(), "2");
+    let [a, b] = [0, 1].map(|at| format!("street/sweep_000{at}.pcd"));
+    let bytes = std::fs::read(folder.path().join(&a)).expect("a file");
+    let rows = read_cloud(&bytes, None).expect("a cloud").points.len();
+    let value = |row: usize, axis: usize| (row % 100) as f64 * 0.01 + axis as f64;
+    let columns = (0..3).flat_map(|axis| (0..rows).map(move |row| value(row, axis)));
+    let columns: Vec<u8> = columns.flat_map(f64::to_le_bytes).collect();
+    let path = folder.path().join("doubles.npz");
+    let mut file = zip::ZipWriter::new(std::fs::File::create(path).expect("a file"));
+    for (name, array) in [
+        (
+            "flow.npy",
+            npy("<f8", true, &format!("({rows}, 3)"), &columns),
+        ),
+        (
+            "valid.npy",
+            npy("|b1", false, &format!("({rows},)"), &vec![1; rows]),
+        ),
+    ] {
+        let options = zip::write::SimpleFileOptions::default();
+        file.start_file(name, options).expect("an entry");
+        file.write_all(&array).expect("written");
+    }
+    file.finish().expect("written");
+    let view = View::start(folder.path(), &[&a, &b, "--flow", "doubles.npz"]);
+    let (_, served) = view.get(&format!("{}/flows/0", view.root), "");
+    let shown = read_flow(&served, None).expect("a flow").flow;
+    let expected = |row: usize| [0, 1, 2].map(|axis| value(row, axis) as f32);
+    assert!(
+        shown
+            .iter()
+            .enumerate()
+            .all(|(row, flow)| *flow == expected(row))
+    );
+    let served = std::io::Cursor::new(served);
+    let mut served = zip::ZipArchive::new(served).expect("an archive");
+    let mut head = Vec::new();
+    let mut flow = served.by_name("flow.npy").expect("the flow");
+    flow.read_to_end(&mut head).expect("its bytes");
+    let head = String::from_utf8_lossy(&head[..128]).into_owned();
+    assert!(head.contains("'<f4'") && head.contains("False"), "{head}");
+}
+
 #[test]
 fn a_given_flow_is_shown_as_it_is_and_one_of_other_sweeps_is_refused() {
     let folder = tempfile::tempdir().expect("a folder");

@@ -16,6 +16,7 @@ const WIDE: Window = Window(1400, 1000);
 
 /// The viewer's state, as an expression.
 const STATE: &str = "document.querySelector('.viewer')?.viewer?.state";
+const VIEWER: &str = "document.querySelector('.viewer').viewer";
 
 /// Two files with a pair: real sweeps if there are some.
 fn pair_files(folder: &Path) -> Vec<PathBuf> {
@@ -340,6 +341,51 @@ async fn a_sequence_plays_with_its_tracks() {
     assert!(picture.colorful(60) > 1_000, "{}", picture.colorful(60));
     browser.click("play").await;
     browser.until(&format!("{STATE}.sweep !== 3")).await;
+    browser.click("play").await;
+    browser.until(&format!("!{STATE}.isPlaying")).await;
+
+    // The picked object is the same one in the next sweep.
+    slide(&browser, "sweep", "1").await;
+    browser
+        .until(&format!("{STATE}.sweep === 1 && {tracked}"))
+        .await;
+    let pick = format!(
+        "{VIEWER}.pickObject({VIEWER}.objects.find((object) => object.id !== null)); \
+         return {STATE}.picked.id"
+    );
+    let picked = browser.run(&pick).await;
+    slide(&browser, "sweep", "2").await;
+    let same = format!("{STATE}.sweep === 2 && {STATE}.picked.id === {picked}");
+    browser.until(&same).await;
+    let card = browser.run(&format!("return {VIEWER}.card.hidden")).await;
+    assert_eq!(card, true, "its numbers are of another sweep");
+
+    // The last sweep has no flow.
+    slide(&browser, "sweep", "4").await;
+    let legend = "document.querySelector('.fv-legend').textContent.includes('height')";
+    browser.until(legend).await;
+
+    browser.run("document.querySelector('.skip').click()").await;
+    let stays = "document.activeElement.id === 'page' && location.hash.startsWith('#/jobs/')";
+    browser.until(stays).await;
+    browser.until(&format!("{STATE}.sweep === 4")).await;
+
+    // A browser without WebGL2 is told so, and nothing else.
+    browser
+        .run(
+            "const context = HTMLCanvasElement.prototype.getContext;
+             HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
+               return kind === 'webgl2' ? null : context.call(this, kind, ...more);
+             };
+             dispatchEvent(new HashChangeEvent('hashchange'));",
+        )
+        .await;
+    let told = "document.querySelector('.fv-message')?.textContent.includes('WebGL2')";
+    browser.until(told).await;
+    browser
+        .run(&format!("return {VIEWER}.reload().then(() => true)"))
+        .await;
+    browser.until(told).await;
     browser.check_peace(&[]).await;
     browser.close().await;
 }

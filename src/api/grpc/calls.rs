@@ -406,9 +406,8 @@ impl SceneFlow for Calls {
         let call = Call::of(&request)?;
         let job = self.named(&call, &request.get_ref().id).await?;
         let SequenceTracks { tracks, .. } = self.service.tracks(&job).await?;
+        let room = self.service.room_for_tracks(&job, &tracks).await?;
         let messages: Vec<proto::Track> = tracks.iter().map(convert::track).collect();
-        let bytes = messages.iter().map(Message::encoded_len).sum();
-        let room = self.service.answers.room(&job.tenant, bytes).await?;
         let (answers, stream) = mpsc::channel(AHEAD);
         let taking = Arc::clone(room.taking());
         tokio::spawn(send_result(messages.into_iter(), answers, taking, room));

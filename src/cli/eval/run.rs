@@ -74,6 +74,10 @@ impl Eval {
             }
         }
         if files::is_tracks(&self.flows[0])? {
+            if !self.source.is_empty() || !self.ego.is_empty() {
+                let text = "--source and --ego are for flows, and the first file has tracks";
+                return Err(Failure::usage(anyhow!(text)));
+            }
             return tracks::run(&self.flows, &self.truth, self.json);
         }
         let names: Vec<String> = self

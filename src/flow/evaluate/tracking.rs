@@ -102,34 +102,32 @@ pub struct TrackingPool {
     sweeps: Vec<TrackedSweep>,
     /// Number of matches that the best assignment of whole identities explains, summed over sequences.
     explained: f64,
-    /// Offsets that keep the identities of sequences apart: those of the current sequence.
-    next: [u32; 2],
+    /// Numbers of true and of found identities so far.
+    identities: [u32; 2],
 }
 
 impl TrackingPool {
     /// Adds a sequence. Identities of other sequences are other objects.
     pub fn add(&mut self, sequence: &[TrackedSweep]) {
-        let [truth, found] = self.next;
         let first = self.sweeps.len();
+        let mut known = [BTreeMap::new(), BTreeMap::new()];
         for sweep in sequence {
-            let shifted = |objects: &[TrackedObject], by: u32| -> Vec<TrackedObject> {
-                let shift = |object: &TrackedObject| TrackedObject {
-                    id: object.id.saturating_add(by),
-                    ..*object
+            let mut numbered = |which: usize, objects: &[TrackedObject]| -> Vec<TrackedObject> {
+                let (known, next) = (&mut known[which], &mut self.identities[which]);
+                let number = |object: &TrackedObject| {
+                    let id = *known.entry(object.id).or_insert_with(|| {
+                        *next += 1;
+                        *next
+                    });
+                    TrackedObject { id, ..*object }
                 };
-                objects.iter().map(shift).collect()
+                objects.iter().map(number).collect()
             };
             let sweep = TrackedSweep {
-                truth: shifted(&sweep.truth, truth),
-                ignored: shifted(&sweep.ignored, truth),
-                found: shifted(&sweep.found, found),
+                truth: numbered(0, &sweep.truth),
+                ignored: numbered(0, &sweep.ignored),
+                found: numbered(1, &sweep.found),
             };
-            let after = |objects: &[TrackedObject], next: u32| {
-                let ids = objects.iter().map(|object| object.id.saturating_add(1));
-                ids.max().unwrap_or(0).max(next)
-            };
-            let [a, b] = self.next;
-            self.next = [after(&sweep.truth, a), after(&sweep.found, b)];
             self.sweeps.push(without_ignored(sweep));
         }
         self.explained += explained(&self.sweeps[first..]);
@@ -348,6 +346,28 @@ mod tests {
             (20, 20, 20)
         );
         assert_eq!((metrics.switches, metrics.distance_m), (0, 0.0));
+        assert_eq!([metrics.mota, metrics.idf1, metrics.hota], [1.0; 3]);
+    }
+
+    #[test]
+    fn large_identities_of_several_sequences_are_different_objects() {
+        let mut pool = TrackingPool::default();
+        for _ in 0..2 {
+            let of = |index: usize| {
+                let x = index as f32;
+                vec![at(u32::MAX, x), at(u32::MAX - 1, 10.0 + x)]
+            };
+            let mut sequence = two(of);
+            for sweep in &mut sequence {
+                sweep.truth.clone_from(&sweep.found);
+            }
+            pool.add(&sequence);
+        }
+        let metrics = pool.metrics();
+        assert_eq!(
+            (metrics.truth, metrics.matches, metrics.switches),
+            (40, 40, 0)
+        );
         assert_eq!([metrics.mota, metrics.idf1, metrics.hota], [1.0; 3]);
     }
 

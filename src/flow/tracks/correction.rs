@@ -2,7 +2,7 @@
 //!
 //! An object that moves before and after does not stand for a tenth of a second in between. Where
 //! the estimate of a pair says so, the rows of its cluster get the motion of the track, if it leads
-//! them nearer to the target than standing still.
+//! them nearer to the target than the flow of the pair.
 
 use super::carried::Carried;
 use super::tracker::{ClusteredSweep, TrackError, TrackedCluster, Tracker};
@@ -14,7 +14,7 @@ use crate::flow::spatial::ColumnIndex;
 const TRUNCATION_M: f32 = 0.3;
 /// Distance over which the distances of neighboring rows are averaged, metres.
 const AROUND_M: f32 = 0.3;
-/// A row stands if the motion leads it farther from the target by more than this, metres.
+/// A row keeps its flow if the motion leads it farther from the target by more than this, metres.
 const FARTHER_M: f32 = 0.05;
 
 /// Pushes the source of a pair to the tracker, and corrects the estimate of the pair by [`correct`],
@@ -64,7 +64,12 @@ pub fn correct(
         let rows = rows.filter(|&(_, &cluster)| cluster == of.cluster as i32);
         let rows: Vec<usize> = rows.map(|(row, _)| row).collect();
         let points: Vec<Point> = rows.iter().map(|&row| source[row]).collect();
-        let still = transform_points(&ego, &points);
+        let mut found = transform_points(&ego, &points);
+        for (&row, to) in rows.iter().zip(&mut found) {
+            if estimate.valid[row] {
+                *to = core::array::from_fn(|a| source[row][a] + estimate.flow[row][a]);
+            }
+        }
         let object = Carried {
             points,
             bounds: objects.clusters[of.cluster as usize].bounds,
@@ -72,7 +77,7 @@ pub fn correct(
             yaw_rate: of.yaw_rate,
         };
         let moved = object.later(&ego, dt_s).points;
-        let farther = farther_m(&target, &still, &moved);
+        let farther = farther_m(&target, &found, &moved);
         if farther.iter().sum::<f32>() >= 0.0 {
             continue;
         }
@@ -95,16 +100,16 @@ pub fn correct(
     corrected
 }
 
-/// How much farther from the target each point is when it has `moved` than when it stands `still`,
+/// How much farther from the target each point is where it has `moved` than where it was `found`,
 /// metres.
-fn farther_m(target: &ColumnIndex, still: &[Point], moved: &[Point]) -> Vec<f32> {
+fn farther_m(target: &ColumnIndex, found: &[Point], moved: &[Point]) -> Vec<f32> {
     let distance = |point: Point| {
         let nearest = target.nearest(point, TRUNCATION_M);
         nearest.map_or(TRUNCATION_M, |(_, square)| square.sqrt())
     };
-    let pairs = still.iter().zip(moved);
+    let pairs = found.iter().zip(moved);
     pairs
-        .map(|(&still, &moved)| distance(moved) - distance(still))
+        .map(|(&found, &moved)| distance(moved) - distance(found))
         .collect()
 }
 
@@ -171,11 +176,12 @@ mod tests {
             yaw_rate: truth.yaw_rate,
         };
         let sweeps = [pair.source.as_slice(), &pair.target];
-        let corrected = |tracked: TrackedCluster| {
-            let mut estimate = missed.clone();
+        let corrected_of = |from: &Estimate, tracked: TrackedCluster| {
+            let mut estimate = from.clone();
             let count = correct(&mut estimate, sweeps, &[tracked], DT_S);
             (estimate, count)
         };
+        let corrected = |tracked| corrected_of(&missed, tracked);
         let (right, count) = corrected(of(truth.velocity, true));
         assert!(count * 10 > rows.len() * 8, "{count} of {}", rows.len());
         let off = |row: &usize| {
@@ -195,5 +201,9 @@ mod tests {
             let (unchanged, count) = corrected(wrong);
             assert_eq!((count, unchanged.flow), (0, missed.flow.clone()));
         }
+        // The pair has found a motion that leads nearer to the target.
+        let faster = truth.velocity.map(|c| 1.25 * c);
+        let (unchanged, count) = corrected_of(&found, of(faster, true));
+        assert_eq!((count, unchanged.flow), (0, found.flow.clone()));
     }
 }

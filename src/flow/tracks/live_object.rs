@@ -53,8 +53,10 @@ pub(super) struct LiveObject {
     pub(super) next: Carried,
     /// Whether it is known to be a track.
     pub(super) confirmed: bool,
-    /// Seconds since it was last observed.
+    /// Seconds for which it has been hidden: 0 where it was observed in the last sweep.
     hidden_s: f32,
+    /// Seconds from the sweep before to the last one.
+    interval_s: f32,
     /// Sweeps in which it moved, up to now and without a gap.
     moved: u32,
     /// Its center when it was first seen, in the frame of the next sweep.
@@ -91,6 +93,7 @@ impl LiveObject {
             },
             confirmed: false,
             hidden_s: 0.0,
+            interval_s: moment.dt_s,
             moved: 0,
             birth: bounds.center,
             way: [0.0; 3],
@@ -177,14 +180,24 @@ impl LiveObject {
         self.carry(&self.next.clone(), moment);
     }
 
-    /// The track, without the predicted states after the object was lost. None if it is not
-    /// confirmed.
-    pub(super) fn into_track(mut self) -> Option<Track> {
-        while !self.is_seen() && self.states.last().is_some_and(|state| state.points == 0) {
+    /// Takes back its states in the last sweeps.
+    pub(super) fn forget_latest(&mut self, sweeps: usize) {
+        self.states
+            .truncate(self.states.len().saturating_sub(sweeps));
+        while self.states.last().is_some_and(|state| state.points == 0) {
             self.states.pop();
         }
+    }
+
+    /// The track, without the predicted states after the object was lost. None if it is not
+    /// confirmed, or has no states.
+    pub(super) fn into_track(mut self) -> Option<Track> {
+        if !self.is_seen() {
+            self.forget_latest(0);
+        }
         fitted_box::fit(&mut self.states);
-        self.confirmed.then_some(Track {
+        let is_track = self.confirmed && !self.states.is_empty();
+        is_track.then_some(Track {
             id: self.id,
             states: self.states,
         })
@@ -198,8 +211,9 @@ impl LiveObject {
     fn velocity_as(&mut self, cluster: &Cluster, dt_s: f32) -> Point {
         let before = Vector3::from(self.next.velocity);
         let change = Vector3::from(cluster.velocity) - before;
-        let most = ACCELERATION * (dt_s + self.hidden_s);
-        if moves(cluster) || change.norm() <= most {
+        // The velocities are those in the middle of their intervals.
+        let most = ACCELERATION * (self.hidden_s + 0.5 * (self.interval_s + dt_s));
+        if cluster.dynamic || change.norm() <= most {
             self.stopped = None;
             let share = (most / change.norm().max(f32::MIN_POSITIVE)).min(1.0);
             return (before + change * share).into();
@@ -237,5 +251,6 @@ impl LiveObject {
             .stopped
             .map(|(place, since)| (transform_point(moment.ego, place), since + moment.dt_s));
         self.next = now.later(moment.ego, moment.dt_s);
+        self.interval_s = moment.dt_s;
     }
 }

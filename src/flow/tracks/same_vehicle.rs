@@ -15,6 +15,8 @@ const PART_SIDE_M: f32 = 1.2;
 const GAP_M: f32 = 1.0;
 /// Largest difference of their velocities, m/s.
 const SAME_VELOCITY: f32 = 0.5;
+/// Least speed of both, m/s. Objects that stand do not show whether they move together.
+const LEAST_SPEED: f32 = 1.0;
 /// Sweeps over which this holds, one after the other.
 const TOGETHER: u32 = 5;
 
@@ -25,8 +27,8 @@ pub(super) struct Companions(Vec<(u32, u32, u32)>);
 impl Companions {
     /// Counts the pairs of `live` objects that move as one vehicle. Where a pair has done so for
     /// [`TOGETHER`] sweeps, its younger object becomes a part of the older. Where the younger alone is
-    /// a track, the older becomes a part of it.
-    pub(super) fn join(&mut self, live: &mut Vec<LiveObject>) {
+    /// a track, the older becomes a part of it. Returns the parts, as they were before that.
+    pub(super) fn join(&mut self, live: &mut Vec<LiveObject>) -> Vec<LiveObject> {
         let mut now = Vec::new();
         let mut joined = vec![false; live.len()];
         for younger in 0..live.len() {
@@ -53,8 +55,14 @@ impl Companions {
             }
         }
         let mut joined = joined.into_iter();
-        live.retain(|_| !joined.next().unwrap_or(false));
+        let mut parts: Vec<LiveObject> = live
+            .extract_if(.., |_| joined.next().unwrap_or(false))
+            .collect();
+        for part in &mut parts {
+            part.forget_latest(TOGETHER as usize);
+        }
         self.0 = now;
+        parts
     }
 }
 
@@ -64,8 +72,15 @@ fn is_one(a: &Carried, b: &Carried) -> bool {
     let width = |object: &Carried| object.bounds.size[0].min(object.bounds.size[1]);
     let is_wide =
         |object: &Carried| object.bounds.size[0].max(object.bounds.size[1]) >= PART_SIDE_M;
+    let speed = |object: &Carried| object.velocity[0].hypot(object.velocity[1]);
+    let center = |object: &Carried| Vector3::from(object.bounds.center).xy();
+    let far = (center(a) - center(b)).norm() > VEHICLE_M[0].hypot(VEHICLE_M[1]);
     // Cheap conditions first.
-    if apart > SAME_VELOCITY || !(is_wide(a) || is_wide(b)) || width(a).max(width(b)) > VEHICLE_M[1]
+    if far
+        || apart > SAME_VELOCITY
+        || speed(a).min(speed(b)) < LEAST_SPEED
+        || !(is_wide(a) || is_wide(b))
+        || width(a).max(width(b)) > VEHICLE_M[1]
     {
         return false;
     }
@@ -91,11 +106,11 @@ mod tests {
     use crate::flow::tracks::association::Candidate;
     use crate::flow::tracks::live_object::Moment;
 
-    /// Two parts of a vehicle, which are 0.5 m apart and move at 10 m/s.
-    fn two_parts() -> Vec<LiveObject> {
+    /// Two parts of a vehicle, which are 0.5 m apart and move at a speed, m/s.
+    fn two_parts(speed: f32) -> Vec<LiveObject> {
         let part = |x: f32| {
             let points = [0.0, 0.5, 1.0, 1.5].map(|along| [x + along, 5.0, 0.5]);
-            let velocity = [10.0, 0.0, 0.0];
+            let velocity = [speed, 0.0, 0.0];
             let bounds = OrientedBox {
                 center: [x + 0.75, 5.0, 0.5],
                 size: [1.5, 0.0, 0.0],
@@ -142,7 +157,7 @@ mod tests {
             ([true, true], 0),
             ([false, true], 1),
         ] {
-            let mut live = two_parts();
+            let mut live = two_parts(10.0);
             for (object, confirmed) in live.iter_mut().zip(confirmed) {
                 object.confirmed = confirmed;
             }
@@ -157,5 +172,32 @@ mod tests {
             assert_eq!(object.id, stays, "{confirmed:?}");
             assert_eq!(object.next.points.len(), 8);
         }
+    }
+
+    #[test]
+    fn objects_that_stand_beside_each_other_stay_two() {
+        let mut live = two_parts(0.0);
+        let mut companions = Companions::default();
+        for _ in 0..2 * TOGETHER {
+            companions.join(&mut live);
+        }
+        assert_eq!(live.len(), 2);
+    }
+
+    #[test]
+    fn a_track_that_becomes_a_part_keeps_its_states_from_before() {
+        let mut live = two_parts(10.0);
+        let state = live[1].states[0];
+        live[1].states = vec![state; 30];
+        for object in &mut live {
+            object.confirmed = true;
+        }
+        let mut companions = Companions::default();
+        let parts = (0..TOGETHER).flat_map(|_| companions.join(&mut live));
+        let tracks: Vec<_> = parts.filter_map(LiveObject::into_track).collect();
+        let [track] = tracks.as_slice() else {
+            panic!("{} tracks", tracks.len());
+        };
+        assert_eq!((track.id, track.states.len()), (1, 25));
     }
 }

@@ -109,12 +109,12 @@ impl Tracker {
         let predicted: Vec<_> = self.live.iter().map(LiveObject::predicted).collect();
         let found = associate(&predicted, &clusters);
         let tracked = self.advance(&moment, &clusters, &found);
-        self.companions.join(&mut self.live);
+        let parts = self.companions.join(&mut self.live);
         let live = std::mem::take(&mut self.live).into_iter();
         let (live, lost): (Vec<_>, Vec<_>) = live.partition(LiveObject::is_alive);
         self.live = live;
-        self.ended
-            .extend(lost.into_iter().filter_map(LiveObject::into_track));
+        let ended = parts.into_iter().chain(lost);
+        self.ended.extend(ended.filter_map(LiveObject::into_track));
         Ok(tracked)
     }
 
@@ -152,14 +152,14 @@ impl Tracker {
             object.observe(moment, clusters, &parts);
             for part in parts {
                 taken[part] = true;
-                known.push(tracked(object, part));
+                known.push(tracked(object, clusters, part));
             }
         }
         for (cluster, candidate) in clusters.iter().enumerate() {
             if candidate.moves && !taken[cluster] {
                 self.ids += 1;
                 let object = LiveObject::new(self.ids, moment, clusters, cluster);
-                known.push(tracked(&object, cluster));
+                known.push(tracked(&object, clusters, cluster));
                 self.live.push(object);
             }
         }
@@ -188,13 +188,14 @@ fn candidates(points: &[Point], moment: &Moment<'_>) -> Vec<Candidate> {
 }
 
 /// What the caller learns of a cluster of `object` in the sweep that it was observed in last.
-fn tracked(object: &LiveObject, cluster: usize) -> TrackedCluster {
+fn tracked(object: &LiveObject, clusters: &[Candidate], cluster: usize) -> TrackedCluster {
     let now = object.states.last().copied().unwrap_or_default();
     TrackedCluster {
         cluster: cluster as u32,
         id: object.id,
         confirmed: object.confirmed,
-        missed: object.is_missed(),
+        // A part of it may move while its main cluster stands.
+        missed: object.is_missed() && !clusters[cluster].moves,
         velocity: now.velocity,
         yaw_rate: now.yaw_rate,
     }
