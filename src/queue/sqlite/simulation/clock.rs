@@ -37,6 +37,18 @@ impl Stand {
         }
     }
 
+    /// The process ends, the wall clock is set by this many milliseconds, and the next one starts.
+    fn restarted(self, set_ms: i64) -> Self {
+        let wall = self.wall.on_clock_ahead(set_ms);
+        time::set(wall, self.monotonic);
+        let disk = self.process.end();
+        Self {
+            process: Process::start(disk, &Promises::options(), true),
+            wall,
+            ..self
+        }
+    }
+
     /// Time passes, and the wall clock is set by this many milliseconds.
     fn pass(&mut self, seconds: u64, set_ms: i64) {
         let passed = Duration::from_secs(seconds);
@@ -71,4 +83,16 @@ fn a_job_waits_and_is_kept_as_long_as_promised_when_the_wall_clock_is_set() {
         stand.pass(11, 0);
         assert_eq!(stand.state(), None, "{set_ms}");
     }
+}
+
+#[test]
+fn what_a_clock_that_was_ahead_has_promised_is_due_in_time_after_a_restart() {
+    let mut stand = Stand::new().restarted(-DAY_MS);
+    stand.pass(50, 0);
+    assert_eq!(stand.state(), Some(State::Queued));
+    stand.pass(11, 0);
+    assert_eq!(stand.state(), Some(State::Expired));
+    let mut stand = stand.restarted(-DAY_MS);
+    stand.pass(101, 0);
+    assert_eq!(stand.state(), None);
 }
