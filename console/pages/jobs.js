@@ -40,7 +40,10 @@ export async function jobsPage(page, signal) {
     fill(failure);
     fill(body, jobs.length > 0 ? jobs.map((job) => rowOf(job, load)) : emptyRow(state));
   };
-  const failed = (error) => fill(failure, el("div", { class: "failure" }, error.message));
+  const failed = (error) => {
+    older.disabled = state.next === null;
+    fill(failure, el("div", { class: "failure" }, error.message));
+  };
   const turn = (next) => {
     if (next) state.before.push(next);
     else state.before.pop();

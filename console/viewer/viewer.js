@@ -152,7 +152,7 @@ export class Viewer {
   show(index) {
     this.#wanted = Math.min(this.#scene.sweeps - 1, Math.max(0, index));
     this.#isStale = true;
-    this.#showing ??= this.#showWanted().finally(() => (this.#showing = null));
+    this.#showing ??= this.#showWanted();
     return this.#showing;
   }
 
@@ -162,6 +162,7 @@ export class Viewer {
       this.#isStale = false;
       isShown = await this.#showSweep(this.#wanted);
     }
+    this.#showing = null;
     return isShown;
   }
 
