@@ -15,8 +15,8 @@ pub(super) const SCHEMA: i32 = 0x666e_7303;
 /// A transaction handles a row that is due.
 pub(super) const SWEEP: i32 = 0x666e_7304;
 
-/// A node recovers the jobs of a dead node, whose number is the second one.
-pub(super) const BURIALS: i32 = 0x666e_7306;
-
 /// A node counts the load.
 pub(super) const COUNT: i32 = 0x666e_7305;
+
+/// A node recovers the jobs of a dead node, whose number is the second one.
+pub(super) const RECOVERY: i32 = 0x666e_7306;

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use super::locks::{BURIALS, NODES};
+use super::locks::{NODES, RECOVERY};
 use super::session::{Call, Flush, Session};
 use super::shared::Shared;
 use super::this_node::ThisNode;
@@ -147,13 +147,17 @@ pub(super) fn look(session: &mut Session, me: i64) -> Result<Look, QueueError> {
 }
 
 /// Recovers the jobs of a dead node and forgets the node, unless another node does.
-pub(super) fn bury(session: &mut Session, dead: Silent, shared: &Shared) -> Result<(), QueueError> {
+pub(super) fn recover(
+    session: &mut Session,
+    dead: Silent,
+    shared: &Shared,
+) -> Result<(), QueueError> {
     let turn = |session: &mut Session, function: &str| {
-        let text = format!("SELECT {function}({BURIALS}, ?1::integer)");
+        let text = format!("SELECT {function}({RECOVERY}, ?1::integer)");
         let row = session.read(Instant::now(), |sql| sql.only(&text, values![dead.node]))?;
         row.get::<bool>(0)
     };
-    // It ends with the connection, so that another node goes on if this one is killed.
+    // The lock ends with the connection. If this node is killed, another one takes it.
     if !turn(session, "pg_try_advisory_lock")? {
         return Ok(());
     }
@@ -161,9 +165,9 @@ pub(super) fn bury(session: &mut Session, dead: Silent, shared: &Shared) -> Resu
         node = dead.node,
         "a node has ended: its jobs are queued again"
     );
-    let buried = recover_and_forget(session, dead, shared);
+    let recovered = recover_and_forget(session, dead, shared);
     turn(session, "pg_advisory_unlock")?;
-    buried
+    recovered
 }
 
 fn recover_and_forget(

@@ -10,7 +10,7 @@ use postgres::fallible_iterator::FallibleIterator;
 
 use super::backlog;
 use super::bell::Changes;
-use super::nodes::{GRACE, GRACE_AFTER_AN_END, SECOND_LOOK, Silent, bury, look, show};
+use super::nodes::{GRACE, GRACE_AFTER_AN_END, SECOND_LOOK, Silent, look, recover, show};
 use super::session::Session;
 use super::shared::Shared;
 use super::statements::refused;
@@ -71,7 +71,7 @@ impl Presence {
             for dead in second.silent {
                 // One that said that it stops does not come back.
                 if first.silent.contains(&dead) && (dead.stopped || !is_early) {
-                    bury(&mut self.session, dead, &self.shared)?;
+                    recover(&mut self.session, dead, &self.shared)?;
                 }
             }
         }
@@ -161,7 +161,7 @@ impl Presence {
         let now = look.silent;
         let before = std::mem::replace(&mut self.suspects, now.clone());
         for dead in now.into_iter().filter(|node| before.contains(node)) {
-            bury(&mut self.session, dead, &self.shared)?;
+            recover(&mut self.session, dead, &self.shared)?;
         }
         Ok(())
     }

@@ -73,8 +73,9 @@ pub(super) struct Upkeep {
     beaten: Instant,
     /// Whether rows are due that the last turn had no time for.
     is_behind: bool,
-    /// When the rows that are due were last read, and when the last pause ended in which they were not.
+    /// When the rows that are due were last read.
     seen: Instant,
+    /// When the last pause ended in which they were not read.
     awake_since: Instant,
     /// Whether a row that was due could not be handled. Each is then handled for itself, so that it does
     /// not keep the others from it.
@@ -268,7 +269,7 @@ impl Upkeep {
 
     /// Handles jobs whose rows are due in one transaction, for a moment.
     fn look_after(&mut self, jobs: &[JobId]) -> Result<Handled, QueueError> {
-        // While nobody could reach the database, nobody could renew a lease.
+        // No lease was renewed while the database could not be reached.
         let options = &self.shared.options;
         let grace = GRACE.min(options.lease);
         let reached_for = self.session.age().min(self.awake_since.elapsed());

@@ -137,7 +137,7 @@ fn in_savepoint<T>(
 }
 
 /// What a turn does besides its commands.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug)]
 struct Upkeep {
     /// By how many milliseconds the wall clock was set. What is due moves with it: it would be due at
     /// once, and results be removed before their time, or not for as long as the clock was set back.

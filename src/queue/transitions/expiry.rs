@@ -37,7 +37,7 @@ pub(in crate::queue) fn next_due(sql: &dyn Sql) -> Result<Option<Timestamp>, Que
 pub(in crate::queue) struct Due {
     /// Jobs whose lease, retry delay or time in the queue has ended.
     pub(in crate::queue) open: Vec<JobId>,
-    /// Jobs whose retention has ended. Somebody waits for the open ones, and nobody for these.
+    /// Jobs whose retention has ended. They are less urgent than the open jobs.
     pub(in crate::queue) ended: Vec<JobId>,
     /// Whether more of them are due than one pass handles.
     pub(in crate::queue) has_more: bool,

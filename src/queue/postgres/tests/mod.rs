@@ -2,11 +2,11 @@
 
 use std::process::Command;
 use std::sync::{Arc, OnceLock};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use tokio::sync::mpsc;
 
-mod burials;
+mod dead_nodes;
 mod nodes;
 mod same_answers;
 mod upkeep;
@@ -24,6 +24,18 @@ use crate::queue::types::{Event, Idempotency, QueueError, QueueOptions, Submissi
 #[path = "../../../../tests/common/postgres_server.rs"]
 mod postgres_server;
 use postgres_server::{PostgresServer, start_postgres};
+
+/// Timeout, long enough for a loaded machine. Only a failing test waits this long.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+/// Waits until something holds. `otherwise` is what is wrong if it never does.
+async fn until(otherwise: &str, holds: impl AsyncFn() -> bool) {
+    let began = Instant::now();
+    while !holds().await {
+        assert!(began.elapsed() < PATIENCE, "{otherwise}");
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+}
 
 /// The server of all tests of this process that crash none, started by the first of them.
 fn shared_postgres() -> Option<&'static PostgresServer> {

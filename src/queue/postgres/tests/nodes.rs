@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
-use super::Database;
+use super::{Database, PATIENCE, until};
 use crate::clock::Timestamp;
 use crate::job::{DeviceKind, JobId, JobProgress, Priority, State};
 use crate::queue::contract_tests::{done, submission};
@@ -16,9 +16,6 @@ use crate::queue::lease::{Lease, Signal};
 use crate::queue::types::{
     Committed, Event, Idempotency, Outcome, QueueOptions, Submission, Submitted,
 };
-
-/// Timeout, long enough for a loaded machine. Only a failing test waits this long.
-const PATIENCE: Duration = Duration::from_secs(30);
 
 async fn lease(queue: &Arc<dyn Queue>) -> Lease {
     let leased = timeout(PATIENCE, queue.lease("worker", DeviceKind::Cpu)).await;
@@ -39,11 +36,8 @@ async fn submit(queue: &Arc<dyn Queue>, submission: Submission) -> JobId {
 
 /// Waits until a worker hears this.
 async fn hears(held: &Lease, signal: Signal) {
-    let began = Instant::now();
-    while held.heartbeat.signal() != signal {
-        assert!(began.elapsed() < PATIENCE, "it does not hear {signal:?}");
-        tokio::time::sleep(Duration::from_millis(5)).await;
-    }
+    let otherwise = format!("it does not hear {signal:?}");
+    until(&otherwise, async || held.heartbeat.signal() == signal).await;
 }
 
 /// Eight lanes of one node, which do jobs until there are none for two seconds. Returns how often
@@ -123,11 +117,8 @@ async fn the_jobs_of_a_node_that_has_ended_go_to_another_at_once_and_its_callers
         (again.job.id, again.job.attempt, again.job.crashes),
         (kept, 2, 1)
     );
-    let began = Instant::now();
-    while survivor.known(vec![forgotten]).await != Ok(Vec::new()) {
-        assert!(began.elapsed() < PATIENCE, "it is kept for nobody");
-        tokio::time::sleep(Duration::from_millis(20)).await;
-    }
+    let is_gone = async || survivor.known(vec![forgotten]).await == Ok(Vec::new());
+    until("it is kept for nobody", is_gone).await;
     let nodes = database
         .server
         .sql(database.name(), "SELECT name FROM nodes");

@@ -1,15 +1,12 @@
 //! Tests of what is due.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use super::Database;
+use super::{Database, until};
 use crate::job::{DeliveryState, DeviceKind, Job, JobId};
 use crate::queue::contract_tests::{done, submission};
 use crate::queue::outgoing::{Action, Settled};
 use crate::queue::types::{QueueOptions, Submission, Submitted};
-
-/// Timeout, long enough for a loaded machine. Only a failing test waits this long.
-const PATIENCE: Duration = Duration::from_secs(30);
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_job_that_cannot_be_forgotten_keeps_no_other() {
@@ -41,11 +38,8 @@ async fn a_job_that_cannot_be_forgotten_keeps_no_other() {
          UPDATE jobs SET due = 1",
         hex(kept)
     ));
-    let began = Instant::now();
-    while queue.known(ids.clone()).await != Ok(vec![kept]) {
-        assert!(began.elapsed() < PATIENCE, "others are kept as well");
-        tokio::time::sleep(Duration::from_millis(50)).await;
-    }
+    let is_alone = async || queue.known(ids.clone()).await == Ok(vec![kept]);
+    until("others are kept as well", is_alone).await;
 }
 
 /// A notice is put off while its delivery is done at another node.
@@ -83,13 +77,9 @@ async fn a_notice_that_is_put_off_as_its_delivery_ends_is_due_at_once() {
     let found = queue.job(&job.tenant, job.id).await.expect("known");
     let state = found.delivery.as_ref().map(|delivery| delivery.state);
     assert_eq!(state, Some(DeliveryState::Delivered));
-    let began = Instant::now();
-    loop {
+    let is_told = async || {
         let taken = queue.take_outgoing(1, hold).await.expect("taken");
-        if matches!(&taken[..], [one] if matches!(one.action, Action::Notify { .. })) {
-            return;
-        }
-        assert!(began.elapsed() < PATIENCE, "it is told in ten minutes");
-        tokio::time::sleep(Duration::from_millis(50)).await;
-    }
+        matches!(&taken[..], [one] if matches!(one.action, Action::Notify { .. }))
+    };
+    until("it is told in ten minutes", is_told).await;
 }
