@@ -81,14 +81,25 @@ export async function call(path, options = {}) {
   return response;
 }
 
+/** The body of a path, read by a method of `Response`. */
+async function body(path, options, read) {
+  const response = await call(path, options);
+  try {
+    return await response[read]();
+  } catch (error) {
+    if (error.name === "AbortError") throw error;
+    throw new Refusal(0, { code: "unreachable", detail: "the answer was interrupted" });
+  }
+}
+
 /** The JSON body of a path. */
-export async function json(path, options = {}) {
-  return (await call(path, options)).json();
+export function json(path, options = {}) {
+  return body(path, options, "json");
 }
 
 /** The bytes of a path. */
-export async function buffer(path, accept) {
-  return (await call(path, { accept })).arrayBuffer();
+export function buffer(path, accept) {
+  return body(path, { accept }, "arrayBuffer");
 }
 
 /**
@@ -148,7 +159,11 @@ function deliver(block, onEvent) {
 
 /** Saves the result of a path as a file. */
 export async function download(path, accept, name) {
-  const blob = await (await call(path, { accept })).blob();
+  saveAs(await body(path, { accept }, "blob"), name);
+}
+
+/** Offers a blob as a file. */
+export function saveAs(blob, name) {
   const link = document.createElement("a");
   link.href = URL.createObjectURL(blob);
   link.download = name;

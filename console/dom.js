@@ -19,7 +19,7 @@ export function el(tag, properties = {}, ...children) {
     if (name === "class") element.className = value;
     else if (name === "data") Object.assign(element.dataset, value);
     else if (name === "on") {
-      for (const [event, listener] of Object.entries(value)) element.addEventListener(event, listener);
+      for (const [event, listener] of Object.entries(value)) element[`on${event}`] = listener;
     } else if (typeof value === "boolean") element[name] = value;
     else element.setAttribute(name, value);
   }
@@ -38,6 +38,55 @@ function append(element, children) {
 export function fill(element, ...children) {
   element.replaceChildren();
   append(element, children);
+}
+
+/** The listeners that `update` replaces. */
+const LISTENERS = ["onclick", "onchange", "oninput"];
+
+/**
+ * Makes the children of an element those that are given, and keeps the elements that are there
+ * already. The focus, the scroll position and open menus stay where the order of these elements does.
+ * Elements with the same name and the same `id` or `test` among their data are the same.
+ */
+export function update(element, ...children) {
+  const wanted = document.createDocumentFragment();
+  append(wanted, children);
+  updateChildren(element, wanted);
+}
+
+function updateChildren(element, wanted) {
+  const there = Map.groupBy(element.childNodes, identityOf);
+  const kept = [...wanted.childNodes].map((child) => [there.get(identityOf(child))?.shift() ?? null, child]);
+  for (const gone of [...there.values()].flat()) gone.remove();
+  let next = element.firstChild;
+  for (const [old, child] of kept) {
+    if (old) updateNode(old, child);
+    if (old && old === next) next = next.nextSibling;
+    else element.insertBefore(old ?? child, next);
+  }
+}
+
+function identityOf(node) {
+  return `${node.nodeName} ${node.dataset?.id ?? node.dataset?.test ?? ""}`;
+}
+
+function updateNode(old, wanted) {
+  if (!(old instanceof Element)) {
+    if (old.data !== wanted.data) old.data = wanted.data;
+    return;
+  }
+  for (const { name } of [...old.attributes]) {
+    // Whether a menu is open is up to the reader.
+    if (!wanted.hasAttribute(name) && name !== "open") old.removeAttribute(name);
+  }
+  for (const { name, value } of wanted.attributes) {
+    if (old.getAttribute(name) === value) continue;
+    // The page's policy forbids styles as attributes.
+    if (name === "style") old.style.cssText = value;
+    else old.setAttribute(name, value);
+  }
+  for (const listener of LISTENERS) old[listener] = wanted[listener];
+  updateChildren(old, wanted);
 }
 
 /** A button. `data` holds data attributes, such as `test`. */
@@ -74,9 +123,9 @@ export function progressBar(name) {
   return el("progress", { max: "1", value: "0", "aria-label": name });
 }
 
-/** Shows a text at the edge of the page for some seconds. */
-export function notice(text, kind = "info") {
-  const shown = el("div", { class: `notice ${kind}` }, text);
+/** Shows a text, or nodes, at the edge of the page for some seconds. */
+export function notice(content, kind = "info") {
+  const shown = el("div", { class: `notice ${kind}` }, content);
   document.getElementById("notices").append(shown);
   setTimeout(() => shown.remove(), 8000);
 }

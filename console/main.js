@@ -9,6 +9,7 @@ import { jobsPage } from "./pages/jobs.js";
 import { queuePage } from "./pages/queue.js";
 import { tryPage } from "./pages/try.js";
 import { localPage } from "./pages/local.js";
+import { shortId } from "./text.js";
 
 const PAGES = [
   { address: "#/", text: "Try it" },
@@ -19,14 +20,14 @@ const PAGES = [
 /** Ends the page that is shown: its timers, streams and viewer. */
 let leave = () => {};
 
-/** The page of an address, as `[function, argument]`. */
+/** The page of an address, as `[function, argument, title]`. */
 function pageOf(path) {
   const [, first, second] = path.split("/");
-  if (first === "jobs" && second) return [jobPage, second];
-  if (first === "jobs") return [jobsPage, null];
-  if (first === "queue") return [queuePage, null];
-  if (first === "view") return [localPage, second];
-  return [tryPage, null];
+  if (first === "jobs" && second) return [jobPage, second, `Job ${shortId(second)}`];
+  if (first === "jobs") return [jobsPage, null, "Jobs"];
+  if (first === "queue") return [queuePage, null, "Queue"];
+  if (first === "view") return [localPage, second, "Files"];
+  return [tryPage, null, "Try it"];
 }
 
 async function show() {
@@ -39,7 +40,8 @@ async function show() {
   const isLocal = path.startsWith("/view");
   showHeader(path, isLocal);
   fill(page, el("p", { class: "loading" }, "Loading …"));
-  const [build, argument] = pageOf(path || "/");
+  const [build, argument, title] = pageOf(path || "/");
+  document.title = `${title} · fnsf`;
   try {
     await build(page, closing.signal, argument);
   } catch (error) {
@@ -73,7 +75,15 @@ function showFailure(page, error) {
 /** Asks for the key in a dialog. `complaint` says why. */
 function askForKey(complaint) {
   if (document.querySelector("dialog[open]")) return;
-  const input = el("input", { type: "password", autocomplete: "off", spellcheck: "false", data: { test: "key-input" } });
+  const input = el("input", {
+    type: "password",
+    autocomplete: "off",
+    spellcheck: "false",
+    // No header carries another one.
+    pattern: "[ -~]*",
+    title: "printable ASCII characters",
+    data: { test: "key-input" },
+  });
   input.value = key();
   const close = (value) => {
     if (value !== null) setKey(value);
@@ -120,7 +130,11 @@ async function start() {
     event.preventDefault();
     document.getElementById("page").focus();
   });
-  addEventListener("hashchange", () => void show());
+  addEventListener("hashchange", () => {
+    void show();
+    // Keys and screen readers go on in the new page.
+    document.getElementById("page").focus({ preventScroll: true });
+  });
   addEventListener("unhandledrejection", (event) => {
     if (event.reason instanceof Refusal) {
       event.preventDefault();

@@ -3,7 +3,7 @@
  * they are asked for, and only the latest ones are kept.
  */
 
-import { buffer, json, Refusal } from "./api.js";
+import { buffer, json } from "./api.js";
 import { readNpz } from "./npz.js";
 
 /** Number of sweeps and of flows that are kept. */
@@ -125,7 +125,11 @@ export class Scene {
     return this.#described.dense !== null;
   }
 
-  /** The tracks of moving objects; an empty list if the job has none. */
+  /**
+   * The tracks of moving objects; an empty list if the job has none.
+   *
+   * @throws {Refusal} If the server refuses them, such as for a method without clusters.
+   */
   tracks() {
     if (!this.#tracks) {
       this.#tracksOf = this.#ended();
@@ -137,13 +141,7 @@ export class Scene {
   async #loadTracks() {
     // Tracks begin with the first pair.
     if (!this.#described.tracks || this.pairs[0]?.state !== "succeeded") return [];
-    try {
-      return (await json(this.#described.tracks)).tracks;
-    } catch (error) {
-      // A method without clusters gives no tracks.
-      if (error instanceof Refusal) return [];
-      throw error;
-    }
+    return (await json(this.#described.tracks)).tracks;
   }
 
   /** The dense cloud. Null if there is none. */

@@ -3,7 +3,7 @@
  */
 
 import { call, download, events, isShared, json, Refusal } from "../api.js";
-import { button, el, fill, notice, progressBar } from "../dom.js";
+import { button, el, fill, notice, progressBar, update } from "../dom.js";
 import { openScene } from "../scene.js";
 import { count, duration } from "../text.js";
 import { createViewer } from "../viewer/viewer.js";
@@ -11,6 +11,9 @@ import { lifeOf } from "./life.js";
 import { repeat } from "./live.js";
 
 const ENDS = ["succeeded", "failed", "cancelled", "expired"];
+/** Refusals after which the job cannot be followed any more; others pass. */
+const FINAL = [401, 403, 404, 410];
+
 /** Seconds between two looks at a queued job: how long it waits changes without an event. */
 const LOOK_SECONDS = 3;
 
@@ -25,40 +28,47 @@ export async function jobPage(page, signal, id) {
     viewer: null,
   };
   fill(page, parts.head, parts.host, parts.life);
-  const update = (job) => {
-    fill(parts.head, headOf(job, path, info));
-    fill(parts.life, lifeOf(job));
+  const show = (job) => {
+    update(parts.head, headOf(job, path, info));
+    update(parts.life, lifeOf(job));
     void showPicture(parts, job, path, signal);
   };
-  update(job);
-  await follow(job, path, signal, parts, update);
+  show(job);
+  await follow(job, path, signal, parts, show);
 }
 
 /** Follows the events of a job until it ends. */
-async function follow(job, path, signal, parts, update) {
+async function follow(job, path, signal, parts, show) {
   let latest = job;
-  const onEvent = async (name, data) => {
-    if (name === "progress") showProgress(parts.head, data);
-    else {
-      // The event of a sequence does not list its pairs, and that of a queued job not how long it waits.
-      latest = data.kind === "sequence" || data.state === "queued" ? await json(path) : data;
-      if (!signal.aborted) update(latest);
-    }
+  let asked = 0;
+  const take = (job) => {
+    latest = job;
+    show(job);
   };
   const look = async () => {
-    if (latest.state !== "queued") return;
-    latest = await json(path);
-    if (!signal.aborted) update(latest);
+    const number = (asked += 1);
+    const job = await json(path, { signal });
+    // An answer that comes late is older than what is shown.
+    if (number === asked) take(job);
   };
-  repeat(LOOK_SECONDS, signal, look, () => {}).catch(() => {});
+  const onEvent = (name, data) => {
+    if (name === "progress") showProgress(parts.head, data);
+    // The event of a sequence does not list its pairs, and that of a queued job not how long it waits.
+    else if (data.kind === "sequence" || data.state === "queued") look().catch(() => {});
+    else {
+      asked += 1;
+      take(data);
+    }
+  };
+  const lookAtQueued = () => (latest.state === "queued" ? look() : Promise.resolve());
+  repeat(LOOK_SECONDS, signal, lookAtQueued, () => {}).catch(() => {});
   while (!signal.aborted && !ENDS.includes(latest.state)) {
     try {
-      await events(`${path}/events`, signal, (name, data) => void onEvent(name, data));
-      latest = await json(path);
-      update(latest);
+      await events(`${path}/events`, signal, onEvent);
+      await look();
     } catch (error) {
       if (signal.aborted) return;
-      if (error instanceof Refusal && error.status >= 400 && error.status < 500) throw error;
+      if (error instanceof Refusal && FINAL.includes(error.status)) throw error;
     }
     await new Promise((resolve) => setTimeout(resolve, 1000));
   }
@@ -157,13 +167,15 @@ function showProgress(head, progress) {
 
 function actionsOf(job, path, info) {
   const hasEnded = ENDS.includes(job.state);
-  const act = (method, target, done) => async () => {
+  const act = (method, target, done, then = () => {}) => async () => {
     try {
       await call(target, { method });
-      notice(done);
     } catch (error) {
       notice(error.message, "bad");
+      return;
     }
+    notice(done);
+    then();
   };
   const actions = [];
   if (job.state === "succeeded") actions.push(downloads(job, path, info));
@@ -172,20 +184,14 @@ function actionsOf(job, path, info) {
     actions.push(button("Cancel", act("DELETE", path, "The job is being cancelled."), { data: { test: "cancel" } }));
   }
   if (hasEnded && job.state !== "succeeded") {
-    const requeue = async () => {
-      await act("POST", job.links.requeue, "The job is queued again.")();
-      dispatchEvent(new HashChangeEvent("hashchange"));
-    };
-    actions.push(button("Queue again", requeue, { data: { test: "requeue" } }));
+    const again = () => dispatchEvent(new HashChangeEvent("hashchange"));
+    actions.push(button("Queue again", act("POST", job.links.requeue, "The job is queued again.", again), { data: { test: "requeue" } }));
   }
   if (job.state === "succeeded") actions.push(button("Share", () => void share(path), { data: { test: "share" } }));
   if (hasEnded) {
-    const remove = async () => {
-      if (!confirm("Remove the job, its sweeps and its result?")) return;
-      await act("DELETE", `${path}?remove=true`, "The job is removed.")();
-      location.hash = "#/jobs";
-    };
-    actions.push(button("Remove", remove, { class: "quiet", data: { test: "remove" } }));
+    const remove = act("DELETE", `${path}?remove=true`, "The job is removed.", () => (location.hash = "#/jobs"));
+    const ask = () => confirm("Remove the job, its sweeps and its result?") && void remove();
+    actions.push(button("Remove", ask, { class: "quiet", data: { test: "remove" } }));
   }
   return actions;
 }
@@ -204,6 +210,13 @@ function downloads(job, path, info) {
   return el("details", { class: "menu", data: { test: "downloads" } }, el("summary", { class: "button" }, "Download"), el("div", {}, items));
 }
 
+/** Copies the text of an input. Pages without https have no clipboard but by a command. */
+async function copy(input) {
+  input.select();
+  if (navigator.clipboard) await navigator.clipboard.writeText(input.value);
+  else document.execCommand("copy");
+}
+
 /** Creates a link for readers without a key, and shows it. */
 async function share(path) {
   const link = await json(`${path}/share`, { method: "POST" });
@@ -213,6 +226,10 @@ async function share(path) {
   const words = link.expires_at
     ? `Whoever has this link can look at the job until ${new Date(link.expires_at).toLocaleString()}.`
     : "This server needs no key, so the link does not expire.";
+  const copied = button("Copy", async () => {
+    await copy(input);
+    copied.textContent = "Copied";
+  }, { class: "primary", data: { test: "copy" } });
   const dialog = el(
     "dialog",
     { "aria-label": "Share link", on: { close: () => dialog.remove() } },
@@ -222,7 +239,7 @@ async function share(path) {
     el(
       "div",
       { class: "actions" },
-      button("Copy", () => void navigator.clipboard?.writeText(address), { class: "primary" }),
+      copied,
       button("Close", () => dialog.close()),
     ),
   );

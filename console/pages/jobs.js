@@ -3,7 +3,7 @@
  */
 
 import { call, json, Refusal } from "../api.js";
-import { button, el, field, fill, notice, select } from "../dom.js";
+import { button, el, field, fill, notice, select, update } from "../dom.js";
 import { between, duration, moment, shortId } from "../text.js";
 import { repeat } from "./live.js";
 
@@ -38,11 +38,11 @@ export async function jobsPage(page, signal) {
     older.disabled = next === null;
     newer.disabled = state.before.length === 0;
     fill(failure);
-    fill(body, jobs.length > 0 ? jobs.map((job) => rowOf(job, load)) : emptyRow(state));
+    update(body, jobs.length > 0 ? jobs.map((job) => rowOf(job, load)) : emptyRow(state));
   };
   const failed = (error) => {
     older.disabled = state.next === null;
-    fill(failure, el("div", { class: "failure" }, error.message));
+    update(failure, el("div", { class: "failure" }, error.message));
   };
   const turn = (next) => {
     if (next) state.before.push(next);
@@ -115,7 +115,7 @@ function actionOf(job, reload) {
       notice(error.message, "bad");
     }
   };
-  if (job.state === "queued" || job.state === "running") return button("Cancel", act("DELETE", job.links.self), { class: "quiet" });
+  if (job.state === "queued" || job.state === "running") return button("Cancel", act("DELETE", job.links.self), { class: "quiet", data: { test: "row-cancel" } });
   if (job.state === "succeeded") return null;
-  return button("Queue again", act("POST", job.links.requeue), { class: "quiet" });
+  return button("Queue again", act("POST", job.links.requeue), { class: "quiet", data: { test: "row-requeue" } });
 }

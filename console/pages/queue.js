@@ -3,7 +3,7 @@
  */
 
 import { json } from "../api.js";
-import { el, fill } from "../dom.js";
+import { el, fill, update } from "../dom.js";
 import { count, duration, moment } from "../text.js";
 import { repeat } from "./live.js";
 import { sparkline } from "./sparkline.js";
@@ -21,15 +21,17 @@ export async function queuePage(page, signal) {
   const tiles = el("div", { class: "tiles" });
   const tables = el("div", {});
   fill(page, el("h1", {}, "Queue"), failure, tiles, tables);
-  const update = async () => {
+  const load = async () => {
     const view = await json("/v1/queue", { signal });
+    // The server has started again.
+    if (history.length > 0 && pairsEnded(view) < history.at(-1).ended) history.length = 0;
     history.push({ at: performance.now(), queued: view.total.jobs, ended: pairsEnded(view) });
     if (history.length > SHOWN) history.shift();
     fill(failure);
-    fill(tiles, tilesOf(view, history));
-    fill(tables, tablesOf(view));
+    update(tiles, tilesOf(view, history));
+    update(tables, tablesOf(view));
   };
-  await repeat(INTERVAL, signal, update, (error) => fill(failure, el("div", { class: "failure" }, error.message)));
+  await repeat(INTERVAL, signal, load, (error) => update(failure, el("div", { class: "failure" }, error.message)));
 }
 
 /** All pairs that have ended on this node, where the caller may see their number. */

@@ -3,7 +3,7 @@
  */
 
 import { buffer, json, Refusal, upload } from "../api.js";
-import { button, el, field, fill, progressBar, select } from "../dom.js";
+import { button, el, field, fill, notice, progressBar, select } from "../dom.js";
 import { bytes, count } from "../text.js";
 import { optionsForm } from "./options.js";
 
@@ -42,8 +42,12 @@ export async function tryPage(page, signal) {
       if (options.densify) options.densify.reference_time = Math.floor((files.length - 1) / 2);
       const body = bodyOf(files, options);
       const job = await upload("/v1/jobs", body, (share) => (bar.value = share));
-      location.hash = `#/jobs/${job.id}`;
+      const address = `#/jobs/${job.id}`;
+      if (signal.aborted) notice(el("a", { href: address }, "The upload is complete: show the job"));
+      else location.hash = address;
     } catch (error) {
+      // The page is left: what is wrong is told at its edge.
+      if (signal.aborted) throw error;
       send.disabled = files.length === 0;
       if (!(error instanceof Refusal)) throw error;
       fill(outcome, el("div", { class: "failure", role: "alert", data: { test: "refusal" } }, error.message));
@@ -53,10 +57,12 @@ export async function tryPage(page, signal) {
     const seed = Math.floor(1000 * Math.random());
     const files = [];
     for (let index = 0; index < sweeps; index += 1) {
+      if (signal.aborted) return;
       fill(outcome, el("p", {}, `Simulating sweep ${index + 1} of ${sweeps} …`));
       const sweep = await buffer(`/v1/street/${index}?seed=${seed}`);
       files.push(new File([sweep], `street_${String(index).padStart(4, "0")}.pcd`));
     }
+    if (signal.aborted) return;
     choose(files);
     await submit(files);
   };

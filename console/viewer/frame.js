@@ -41,7 +41,7 @@ export class Frame {
     this.pair = pair;
     this.count = source.length / 3;
     this.positions = withoutNaN(source);
-    this.targetPositions = target && withoutNaN(target);
+    this.targetPositions = target && withReturn(target);
     this.ego = pair?.ego ? fromRows(pair.ego) : null;
     this.sourceFromTarget = this.ego ? inverseRigid(this.ego) : identity();
     this.residual = this.ego ? this.#residual() : null;
@@ -153,6 +153,11 @@ export class Frame {
 function withoutNaN(points) {
   if (!points.some(Number.isNaN)) return points;
   return points.map((value) => (Number.isNaN(value) ? 0 : value));
+}
+
+/** The points without the rows that have no return. */
+function withReturn(points) {
+  return points.some(Number.isNaN) ? points.filter((_, at) => !Number.isNaN(points[at - (at % 3)])) : points;
 }
 
 /** A dense cloud, as it is drawn. */

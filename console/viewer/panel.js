@@ -17,7 +17,8 @@ const LAYERS = [
 
 const DENSE_COLORS = [["height", "height"], ["sweep", "sweep"], ["dynamic", "moving points"]];
 
-const KEYS = "Keys: arrows turn, + − zoom, 1–4 cameras, F fit, space plays, [ ] sweeps, M measures, Esc ends.";
+const KEYS =
+  "Keys: arrows turn, + − zoom, 1–4 cameras, F fit, space plays, [ ] sweeps, O next object, M measures, Esc ends.";
 
 /**
  * Builds the controls. `state` is changed by them, and `changed(name)` is called then.
@@ -44,7 +45,7 @@ export function buildControls(state, scene, changed, actions) {
   const denseColor = select(DENSE_COLORS, state.denseColor, (value) => set("denseColor", value));
   const confidence = el("input", { type: "range", min: "0", max: "1", step: "0.01", data: { test: "confidence" }, on: { input: () => set("confidence", Number(confidence.value)) } });
   const confidenceText = el("output", {});
-  const shown = el("p", { class: "fv-shown", data: { test: "shown" }, "aria-live": "polite" });
+  const shown = el("p", { class: "fv-shown", data: { test: "shown" } });
   const views = Object.keys(VIEWS).map((name, index) =>
     button(name, () => actions.camera(name), { data: { test: `camera-${name}` }, title: `Key ${index + 1}` }),
   );
@@ -86,7 +87,7 @@ export function buildControls(state, scene, changed, actions) {
     ofPair.hidden = state.dense;
     ofDense.hidden = !state.dense;
     player.element.hidden = state.dense;
-    enable(layers.find(([name]) => name === "tracks")[1].box, state.hasTracks, "There are no tracks.");
+    enable(layers.find(([name]) => name === "tracks")[1].box, state.hasTracks, state.whyNoTracks);
     enable(layers.find(([name]) => name === "moved")[1].box, frame?.pair, "There is no flow.");
     enable(ground.box, frame?.pair?.cluster, "The method finds no clusters.");
     enable(ego.box, frame?.ego, "The ego motion is not known.");
@@ -98,11 +99,18 @@ export function buildControls(state, scene, changed, actions) {
     }
     color.value = frame?.shownColor(state.color) ?? state.color;
     confidence.value = String(state.confidence);
-    confidenceText.textContent = state.confidence.toFixed(2);
-    shown.textContent = `${state.pointsDrawn.toLocaleString("en-US")} points`;
+    setText(confidenceText, state.confidence.toFixed(2));
+    // Read out by a screen reader, but not while it plays.
+    shown.setAttribute("aria-live", state.isPlaying ? "off" : "polite");
+    setText(shown, `${state.pointsDrawn.toLocaleString("en-US")} points`);
     player.update(frame);
   };
   return { panel, player: player.element, update };
+}
+
+/** Sets a text. A text that stays is not set again: a screen reader would repeat it. */
+function setText(element, text) {
+  if (element.textContent !== text) element.textContent = text;
 }
 
 function enable(control, isPossible, why) {
@@ -115,9 +123,9 @@ function enable(control, isPossible, why) {
 function buildPlayer(state, scene, set, actions) {
   const play = button("▶", actions.play, { data: { test: "play" }, title: "Space", "aria-label": "Play" });
   const time = el("input", { type: "range", min: "0", max: "1", step: "0.01", "aria-label": "Time from source to target", data: { test: "time" }, on: { input: () => set("time", Number(time.value)) } });
-  const timeText = el("output", { class: "fv-time" });
+  const timeText = el("span", { class: "fv-time" });
   const sweep = el("input", { type: "range", min: "0", max: String(Math.max(0, scene.sweeps - 1)), step: "1", "aria-label": "Sweep", data: { test: "sweep" }, on: { input: () => actions.sweep(Number(sweep.value)) } });
-  const sweepText = el("output", { class: "fv-time" });
+  const sweepText = el("span", { class: "fv-time" });
   const step = (by, text, label) => button(text, () => actions.sweep(state.sweep + by), { "aria-label": label, title: by < 0 ? "Key [" : "Key ]" });
   const speed = select([["1", "1×"], ["0.5", "½×"], ["0.2", "⅕×"]], "1", (value) => (state.speed = Number(value)), { "aria-label": "Speed", class: "fv-speed" });
   const isSequence = scene.sweeps > 2;
@@ -128,11 +136,11 @@ function buildPlayer(state, scene, set, actions) {
   const update = (frame) => {
     time.value = String(state.time);
     time.disabled = !frame?.pair;
-    timeText.textContent = frame?.pair ? `${(state.time * frame.pair.dt).toFixed(3)} s` : "–";
+    setText(timeText, frame?.pair ? `${(state.time * frame.pair.dt).toFixed(3)} s` : "–");
     sweep.value = String(state.sweep);
-    sweepText.textContent = `${state.sweep + 1} / ${scene.sweeps}`;
+    setText(sweepText, `${state.sweep + 1} / ${scene.sweeps}`);
     sweepText.title = scene.sweepNames?.[state.sweep] ?? "";
-    play.textContent = state.isPlaying ? "❚❚" : "▶";
+    setText(play, state.isPlaying ? "❚❚" : "▶");
     play.setAttribute("aria-label", state.isPlaying ? "Pause" : "Play");
   };
   return { element, update };

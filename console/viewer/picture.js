@@ -83,9 +83,10 @@ export class Picture {
     this.renderer.set("dense", isNew ? { positions: frame.positions, motions: null, colors: this.colors } : { colors: this.colors });
   }
 
-  /** What can be picked, with the arrays that `pick` takes. */
+  /** What can be picked, with the arrays that `pick` takes. Null if no point is drawn that has numbers. */
   pickable() {
     const { state, frame, denseFrame } = this.viewer;
+    if (!state.dense && !state.layers.moved && !state.layers.source) return null;
     if (state.dense) return { positions: denseFrame.positions, motions: null, colors: this.colors, time: 0 };
     return { positions: frame.positions, motions: this.motions, colors: this.colors, time: this.#time() };
   }

@@ -2,6 +2,11 @@
  * Saves the picture with its labels and its legend.
  */
 
+import { saveAs } from "../api.js";
+
+/** Size of texts, pixels of the page. */
+const TEXT_SIZE = 12;
+
 /**
  * Draws the canvas, the labels and the legend into one picture and offers it as a file.
  *
@@ -19,22 +24,21 @@ export function saveScreenshot(canvas, host, name) {
   const style = getComputedStyle(host);
   context.textBaseline = "top";
   context.fillStyle = style.color;
-  const put = (element, size) => {
-    const box = element.getBoundingClientRect();
-    context.font = `${size * scale}px ${style.fontFamily}`;
-    context.fillText(element.textContent, (box.left - outer.left) * scale, (box.top - outer.top) * scale);
+  context.font = `${TEXT_SIZE * scale}px ${style.fontFamily}`;
+  const put = (text) => {
+    const range = document.createRange();
+    range.selectNodeContents(text);
+    // A text that is hidden has no place.
+    const box = range.getClientRects()[0];
+    if (box) context.fillText(text.data, (box.left - outer.left) * scale, (box.top - outer.top) * scale);
   };
-  for (const label of host.querySelectorAll(".fv-label:not([hidden])")) put(label, 12);
-  for (const text of host.querySelectorAll(".fv-legend p")) put(text, 12);
+  for (const shown of host.querySelectorAll(".fv-labels, .fv-legend")) {
+    const texts = document.createTreeWalker(shown, NodeFilter.SHOW_TEXT);
+    while (texts.nextNode()) put(texts.currentNode);
+  }
   for (const image of host.querySelectorAll(".fv-legend canvas")) {
     const box = image.getBoundingClientRect();
     context.drawImage(image, (box.left - outer.left) * scale, (box.top - outer.top) * scale, box.width * scale, box.height * scale);
   }
-  picture.toBlob((blob) => {
-    const link = document.createElement("a");
-    link.href = URL.createObjectURL(blob);
-    link.download = `${name}.png`;
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
-  });
+  picture.toBlob((blob) => saveAs(blob, `${name}.png`));
 }

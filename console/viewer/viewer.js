@@ -70,6 +70,7 @@ export class Viewer {
       ego: false,
       dense: false,
       hasTracks: false,
+      whyNoTracks: "There are no tracks.",
       layers: { moved: true, source: false, target: true, boxes: true, tracks: true },
       picked: null,
       isMeasuring: false,
@@ -135,7 +136,11 @@ export class Viewer {
 
   /** The tracks and the dense cloud, after the first picture. */
   async #loadRest() {
-    this.#tracks = await this.#scene.tracks().catch(() => []);
+    this.state.whyNoTracks = "There are no tracks.";
+    this.#tracks = await this.#scene.tracks().catch((error) => {
+      this.state.whyNoTracks = `There are no tracks: ${error.message}`;
+      return [];
+    });
     this.state.hasTracks = this.#tracks.length > 0;
     if (this.#closing.signal.aborted) return;
     if (this.state.dense) await this.#showDense();
@@ -360,6 +365,7 @@ export class Viewer {
     else if (key === "[" || key === "]") actions.sweep(state.sweep + (key === "[" ? -1 : 1));
     else if (key.toLowerCase() === "f") actions.fit();
     else if (key.toLowerCase() === "m") actions.measure();
+    else if (key.toLowerCase() === "o") this.#pickNext();
     else if (key === "Escape") this.#clear();
     else return false;
     this.redraw();
@@ -383,7 +389,8 @@ export class Viewer {
     this.canvas.focus();
     if (!(this.state.dense ? this.denseFrame : this.frame)) return;
     const pointer = { x, y, width: this.canvas.clientWidth, height: this.canvas.clientHeight };
-    const row = pick(this.#picture.pickable(), this.#picture.view, pointer);
+    const points = this.#picture.pickable();
+    const row = points && pick(points, this.#picture.view, pointer);
     if (row === null) {
       if (!this.state.isMeasuring) this.#clear();
       return;
@@ -421,6 +428,15 @@ export class Viewer {
     this.state.picked = { row, cluster: cluster < 0 ? null : cluster, id: object?.id ?? null };
     const rows = [...rowsOfPoint(this.frame, row), ...(object ? rowsOfObject(object) : [])];
     showCard(this.card, "Point", rows, () => this.#clear());
+  }
+
+  /** Picks the object after the picked one, among those that the picture shows. */
+  #pickNext() {
+    const { boxes, picked } = this.state;
+    if (boxes.length === 0) return;
+    const isPicked = ({ id, cluster }) => (id === null ? cluster === picked?.cluster : id === picked?.id);
+    const next = boxes[(boxes.findIndex(isPicked) + 1) % boxes.length];
+    this.pickObject(this.objects.find(({ id, cluster }) => id === next.id && cluster === next.cluster));
   }
 
   /** Shows the numbers of an object whose label was clicked. */

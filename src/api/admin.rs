@@ -139,8 +139,9 @@ async fn nodes(State(admin): State<Admin>) -> Response {
 
 async fn expose(State(admin): State<Admin>, headers: HeaderMap) -> Response {
     let oldest = match admin.queue.oldest_queued().await {
-        Ok(Some(oldest)) => oldest.until(Timestamp::now()),
-        Ok(None) | Err(_) => Duration::ZERO,
+        Ok(Some(oldest)) => Some(oldest.until(Timestamp::now())),
+        Ok(None) => Some(Duration::ZERO),
+        Err(_) => None,
     };
     let backlog = admin.queue.backlog();
     let work_seconds = admin.cost.seconds(backlog.queued().seconds);

@@ -168,7 +168,7 @@ fn with_report(json: &[u8], report: &Report, job: &str) -> Result<Vec<u8>, ApiEr
 }
 
 /// Upper bound on the memory of the decoded clouds of a file: 12 bytes for a point and one for its
-/// mask, for each row that the file declares.
+/// mask, for each row that the file declares, and what decoding holds beside them.
 ///
 /// # Errors
 /// [`ApiError::BadInput`] or [`ApiError::TooLarge`], with the name of the part and the defect.
@@ -181,7 +181,9 @@ pub(super) fn unfolded_bytes(
     const ROW: u64 = size_of::<crate::flow::Point>() as u64 + 1;
     let rows = formats::declared_rows(bytes, name).map_err(|error| in_part(part, error))?;
     // A file with several arrays is read up to two clouds and their two masks.
-    Ok(rows.min(4 * most) as u64 * ROW)
+    let points = rows.min(4 * most) as u64 * ROW;
+    let working = formats::working_bytes(bytes, name).map_err(|error| in_part(part, error))?;
+    Ok(points.saturating_add(working))
 }
 
 /// Decodes one cloud in any supported format, with at most `most` points.

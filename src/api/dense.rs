@@ -14,7 +14,7 @@ use super::result_budget::{Encoded, ResultReservation};
 use super::service::Service;
 use crate::cost::CostModel;
 use crate::flow::densify::Plan;
-use crate::flow::{DenseCloud, window};
+use crate::flow::{DenseCloud, Options, window};
 use crate::formats::{DENSE_FORMATS, DenseFormat, write_dense};
 use crate::job::{
     DenseReport, Densify, InvalidOptions, Job, JobId, JobOptions, Kind, LaterSweepsChoice,
@@ -43,7 +43,7 @@ pub(super) struct Finalizer {
 
 impl Finalizer {
     /// The additional work for a sequence whose sweep `i` has `points[i]` points. With `chained`
-    /// each backward pair starts from the field of the one before; `sweeps` is the window size.
+    /// each backward pair starts from the field of the one before. `options` are those of the pairs.
     ///
     /// # Errors
     /// [`ApiError::InvalidOptions`] if the options do not fit the number of sweeps.
@@ -51,7 +51,7 @@ impl Finalizer {
         asked: &Densify,
         points: &[usize],
         chained: bool,
-        sweeps: usize,
+        options: &Options,
     ) -> Result<Self, ApiError> {
         let plan = asked.plan(points.len()).map_err(InvalidOptions::Densify)?;
         let back = plan
@@ -61,12 +61,12 @@ impl Finalizer {
         let back = back.enumerate().map(|(turn, edge)| PairOf {
             index: edge.target as u32,
             backward: true,
-            window: PairOf::seen(window_back(edge.target, points.len(), sweeps)),
+            window: PairOf::seen(window_back(edge.target, points.len(), options.sweeps())),
             chained: chained && turn > 0,
         });
         Ok(Self {
             back: back.collect(),
-            nominal_seconds: CostModel::asking(questions(asked, &plan, points)),
+            nominal_seconds: CostModel::asking(questions(asked, &plan, points, options)),
         })
     }
 }
@@ -80,12 +80,14 @@ fn window_back(index: usize, count: usize, sweeps: usize) -> Range<usize> {
 }
 
 /// The number of field evaluations until all points are at the reference time.
-fn questions(asked: &Densify, plan: &Plan, points: &[usize]) -> f64 {
+fn questions(asked: &Densify, plan: &Plan, points: &[usize], options: &Options) -> f64 {
     let of_sweep = |(index, &points): (usize, &usize)| {
         let steps = (plan.reference_time() - index as f64).abs().ceil();
         let inverted = asked.later_sweeps == LaterSweepsChoice::Inverse
             && index as f64 > plan.reference_time();
-        let each = if inverted {
+        let each = if options.is_known_at_points() {
+            1.0
+        } else if inverted {
             CORRECTIONS
         } else {
             f64::from(asked.substeps)

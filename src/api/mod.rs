@@ -17,6 +17,7 @@ mod grpc;
 mod http;
 mod job_list;
 mod job_request;
+mod job_watch;
 mod kept_result;
 mod listener;
 mod lost;

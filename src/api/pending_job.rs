@@ -398,8 +398,8 @@ impl PendingJob {
         let mut finalizer_seconds = None;
         if let Some(densify) = &self.request.options.densify {
             let options = &self.request.options;
-            let (chained, sweeps) = (options.chained(), options.sweeps());
-            let closing = Finalizer::of(densify, &self.points, chained, sweeps)?;
+            let solver = options.solver_options(0);
+            let closing = Finalizer::of(densify, &self.points, options.chained(), &solver)?;
             pairs.extend(closing.back);
             finalizer_seconds = Some(closing.nominal_seconds);
         }

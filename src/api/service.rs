@@ -363,22 +363,6 @@ impl Service {
         Ok(self.queue.requeue(id, lost).await?)
     }
 
-    /// Subscribes to a job of the caller's tenant: its state and, while it runs, its progress. The
-    /// receiver holds the latest version of the job. It closes when the job has ended.
-    ///
-    /// # Errors
-    /// - [`ApiError::NotFound`] if there is no such job, or another tenant owns it.
-    /// - [`ApiError::StoreUnavailable`], [`ApiError::DiskFull`] or [`ApiError::Draining`] if the
-    ///   queue fails or is closed.
-    pub async fn watch(
-        &self,
-        caller: &Caller,
-        id: JobId,
-    ) -> Result<watch::Receiver<Arc<Job>>, ApiError> {
-        self.job(caller, id).await?;
-        Ok(self.queue.watch(id).await?)
-    }
-
     /// Waits until a job of any tenant ends, for at most `longest` (without limit if `None`), or
     /// until [`Service::close_streams`] is called.
     ///

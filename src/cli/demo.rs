@@ -13,7 +13,7 @@ use super::eval::print_score;
 use super::failure::Failure;
 use super::files;
 use super::flow::print_report;
-use super::output::say;
+use super::output::{say, without_reader};
 use super::submit::until_ended;
 use super::synth::labelled;
 use super::terminal::Terminal;
@@ -66,7 +66,7 @@ impl Demo {
         let truth = pair.truth.take().unwrap_or_default();
 
         let answer = self.through_the_service(&pair)?;
-        print_report(&answer.report)?;
+        without_reader(print_report(&answer.report))?;
         let flow = self.output.join("flow.npz");
         let picture = self.output.join("flow.png");
         files::write(&flow, |file| std::io::Write::write_all(file, &answer.bytes))?;
@@ -79,7 +79,7 @@ impl Demo {
         say(format_args!(
             "against the simulator's truth, ground left out:"
         ))?;
-        print_score(&answer.flow, &truth, &pair)
+        without_reader(print_score(&answer.flow, &truth, &pair))
     }
 
     fn through_the_service(&self, pair: &Pair) -> Result<Answer, Failure> {

@@ -68,9 +68,9 @@ impl Failure {
         self.kind == Kind::BadInput
     }
 
-    /// Whether the failure is printed.
-    pub(super) fn is_worth_a_word(&self) -> bool {
-        self.kind != Kind::ReaderGone
+    /// Whether the reader of stdout has closed the pipe.
+    pub(super) fn is_of_reader(&self) -> bool {
+        self.kind == Kind::ReaderGone
     }
 
     pub(super) fn exit_code(&self) -> ExitCode {

@@ -7,7 +7,7 @@ use url::form_urlencoded::Serializer;
 
 use super::client::{Client, ServerFlags, block_on};
 use super::failure::Failure;
-use super::output::say;
+use super::output::{say, show};
 
 /// Number of jobs on a page of a list.
 const PAGE: usize = 500;
@@ -93,7 +93,7 @@ impl Jobs {
             Command::Show { id } => {
                 let job = client.call(Method::GET, &path(id, "")).await;
                 let job = job.map_err(Failure::internal)?;
-                say(format_args!("{job:#}"))
+                show(format_args!("{job:#}"))
             }
             Command::Cancel(of) => each(client, of, &CANCEL).await,
             Command::Requeue(of) => each(client, of, &REQUEUE).await,
@@ -181,7 +181,7 @@ async fn find(client: &Client, filter: &Filter, limit: usize) -> Result<Vec<Valu
 async fn list(client: &Client, filter: &Filter, limit: usize, json: bool) -> Result<(), Failure> {
     for job in find(client, filter, limit).await? {
         if json {
-            say(format_args!("{job}"))?;
+            show(format_args!("{job}"))?;
             continue;
         }
         let text = |key: &str| job[key].as_str().unwrap_or("-").to_owned();
@@ -200,7 +200,7 @@ async fn list(client: &Client, filter: &Filter, limit: usize, json: bool) -> Res
             .into_iter()
             .chain(labels);
         let rest: Vec<String> = rest.filter(|text| !text.is_empty()).collect();
-        say(format_args!(
+        show(format_args!(
             "{}  {:<9}  {:<8}  {}  {}",
             text("id"),
             text("state"),

@@ -98,7 +98,7 @@ pub fn run(arguments: Arguments) -> ExitCode {
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            if failure.is_worth_a_word() {
+            if !failure.is_of_reader() {
                 output::complain(format_args!("{failure}"));
             }
             failure.exit_code()

@@ -6,17 +6,34 @@ use std::io::{self, Write};
 use super::failure::Failure;
 use crate::text::printable;
 
-/// Prints one line on stdout.
+/// Prints one line on stdout, of a command that does nothing but print: it ends with its reader.
 ///
 /// # Errors
 /// [`Failure::reader_gone`] where the reader has closed the pipe, an internal failure for any other
 /// write error.
-pub(super) fn say(line: fmt::Arguments<'_>) -> Result<(), Failure> {
+pub(super) fn show(line: fmt::Arguments<'_>) -> Result<(), Failure> {
     let mut stdout = io::stdout().lock();
     writeln!(stdout, "{}", shown(line)).map_err(|error| match error.kind() {
         io::ErrorKind::BrokenPipe => Failure::reader_gone(error),
         _ => Failure::internal(error),
     })
+}
+
+/// Prints one line on stdout, of a command that writes files or changes jobs: it goes on without a
+/// reader.
+///
+/// # Errors
+/// An internal failure for any write error but a closed pipe.
+pub(super) fn say(line: fmt::Arguments<'_>) -> Result<(), Failure> {
+    without_reader(show(line))
+}
+
+/// The result of [`show`] in a command that goes on without a reader.
+pub(super) fn without_reader(shown: Result<(), Failure>) -> Result<(), Failure> {
+    match shown {
+        Err(failure) if failure.is_of_reader() => Ok(()),
+        shown => shown,
+    }
 }
 
 /// Prints a warning or an error on stderr, after the name of the program.

@@ -10,7 +10,7 @@ use serde::Serialize;
 use tokio::signal::unix::{SignalKind, signal};
 
 use super::failure::Failure;
-use super::output::say;
+use super::output::{say, show};
 use crate::app::App;
 use crate::config::{Config, ConfigError, LogFormat, NodeRole};
 use crate::telemetry::Telemetry;
@@ -105,11 +105,11 @@ impl Serve {
         let config = Config::load(self.config.as_deref(), &self.flags).map_err(Failure::usage)?;
         if self.print_config {
             let text = config.to_toml().map_err(Failure::internal)?;
-            return say(format_args!("{}", text.trim_end()));
+            return show(format_args!("{}", text.trim_end()));
         }
         App::check(&config).map_err(Failure::usage)?;
         if self.check_config {
-            return say(format_args!("the configuration is good"));
+            return show(format_args!("the configuration is good"));
         }
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .enable_all()

@@ -5,6 +5,8 @@
 //! the number of multiply-adds that take equally long on a CPU. Independent of the device: a
 //! throughput in multiply-adds per second turns work into seconds.
 
+use std::collections::BTreeMap;
+
 use super::data::Point;
 use super::distance::DistanceTransform;
 use super::error::FlowError;
@@ -12,17 +14,25 @@ use super::field::{LAID_OUT, LinearGrid, PARAMETERS, chamfer_work, check_chamfer
 use super::options::{FieldOptions, LossOptions, Method, ModelOptions, Options};
 use super::problem::Problem;
 use super::select::{find_ground, select};
+use super::spatial::{NOISE, dbscan};
 
 /// Network passes per point and iteration: one forward pass, and a backward pass that costs two.
 const PASSES: f64 = 3.0;
 /// Fixed cost of an iteration (gradient sum, Adam, transposes), expressed in points.
 const STEP_POINTS: f64 = 150.0;
-/// Fixed cost of a registration, multiply-adds: nine coarse fits, and a fine fit of 8,192 points.
+/// Fixed cost of a registration, multiply-adds: nine coarse fits, as nearly all pairs need, and a fine
+/// fit of 8,192 points.
 const ALIGNING: f64 = 4e9;
 /// Cost per point of the registration's voxel downsampling and surfels, multiply-adds.
 const THINNING: f64 = 2e4;
 /// Peak bytes per point of the same step: the point, a cached copy, its voxel and its surfels.
 const THINNING_BYTES: usize = 96;
+/// Peak bytes per point of either cloud where nothing is registered: the ground, the clouds without
+/// it, and the indices by which their overlap is measured.
+const OVERLAP_BYTES: usize = 96;
+/// Bytes per point of either cloud from which a sample is drawn: the point, its row and its place in
+/// the order.
+const DRAWN_FROM_BYTES: usize = 28;
 /// Cost per point of the object search, multiply-adds. Its bytes per point cover the cell, the
 /// voxel-downsampled copies, three spatial indices and the normal.
 const LABELLING: f64 = 4e5;
@@ -36,9 +46,6 @@ const CORRESPONDENCE_BYTES: usize = 128;
 const PLACED_BYTES: usize = 72;
 /// Work of the linear model per point and iteration, with the distance query, multiply-adds.
 const BLENDED: f64 = 1e4;
-/// Assumed number of points of a partition's cluster, in both clouds: the mean over the points of
-/// three sweeps is 300 to 1,900.
-const CLUSTER_POINTS: usize = 1000;
 /// Work of the local consistency per pair of points, multiply-adds.
 const CONSISTENCY: f64 = 20.0;
 /// Parameter sets held at once: the network, its transposes, its optimizer and the result (6), and
@@ -132,6 +139,12 @@ pub fn predict_cost(problem: &Problem, options: &Options) -> Result<Cost, FlowEr
         Some(_) => ALIGNING + registered as f64 * THINNING,
         None => 0.0,
     };
+    let unregistered = match registered {
+        0 => problem.source.len() + problem.target.len(),
+        _ => 0,
+    };
+    let undrawn = selection.undrawn.iter().flatten();
+    let undrawn: usize = undrawn.map(Vec::len).sum();
     let neighbors = problem.nearest_neighbors(options.sweeps());
     let neighbors = neighbors
         .iter()
@@ -147,6 +160,8 @@ pub fn predict_cost(problem: &Problem, options: &Options) -> Result<Cost, FlowEr
         bytes: method.bytes
             + (POINT_COPIES * source_points + target_points) * size_of::<Point>()
             + registered * THINNING_BYTES
+            + unregistered * OVERLAP_BYTES
+            + undrawn * DRAWN_FROM_BYTES
             + neighbor_bytes
             + WORKING_SETS,
         multiply_adds: method.multiply_adds
@@ -179,14 +194,15 @@ fn field_cost(clouds: [&[Point]; 2], options: &FieldOptions) -> Result<MethodCos
     let [source, _] = clouds;
     let batch = options.batch.unwrap_or(source.len()).min(source.len());
     let iterations = options.expected_iterations() as f64;
-    let mut cost = target_cost(clouds, batch, options)?;
+    let cluster = cluster_points(source, options);
+    let mut cost = target_cost(clouds, batch, options, cluster)?;
     if options.consistency_weight > 0.0 {
-        let others = batch.min(CLUSTER_POINTS) as f64;
+        let others = cluster.map_or(batch, |points| batch.min(points)) as f64;
         cost.multiply_adds += iterations * batch as f64 * others * CONSISTENCY;
     }
     let mut networks = 1;
     if options.has_cycle() {
-        let back = target_cost([source, source], batch, options)?;
+        let back = target_cost([source, source], batch, options, cluster)?;
         cost.bytes += back.bytes;
         cost.multiply_adds += back.multiply_adds;
         networks = 2;
@@ -215,11 +231,30 @@ fn field_cost(clouds: [&[Point]; 2], options: &FieldOptions) -> Result<MethodCos
     Ok(cost)
 }
 
+/// Points of the cluster that a point of the source is in, on average: each point is compared with
+/// those of its own cluster. None where the source is not partitioned.
+fn cluster_points(source: &[Point], options: &FieldOptions) -> Option<usize> {
+    let partition = options.partition.as_ref()?;
+    let clusters = || dbscan::clusters(source, partition.radius_m, partition.min_points);
+    // A prediction takes one core from the pairs that are being computed, and no more.
+    let labels = match rayon::ThreadPoolBuilder::new().num_threads(1).build() {
+        Ok(thread) => thread.install(clusters),
+        Err(_) => clusters(),
+    };
+    let mut sizes: BTreeMap<u32, usize> = BTreeMap::new();
+    for label in labels.into_iter().filter(|&label| label != NOISE) {
+        *sizes.entry(label).or_default() += 1;
+    }
+    let squares: usize = sizes.values().map(|size| size * size).sum();
+    Some(squares / sizes.values().sum::<usize>().max(1))
+}
+
 /// The preparation of a target, and the queries of its distances in all iterations.
 fn target_cost(
     [source, target]: [&[Point]; 2],
     batch: usize,
     options: &FieldOptions,
+    cluster: Option<usize>,
 ) -> Result<MethodCost, FlowError> {
     let iterations = options.expected_iterations() as f64;
     Ok(match &options.loss {
@@ -235,10 +270,7 @@ fn target_cost(
         }
         LossOptions::Chamfer(loss) => {
             check_chamfer(loss, target).map_err(FlowError::Backend)?;
-            let searched = match options.partition {
-                None => target.len(),
-                Some(_) => target.len().min(CLUSTER_POINTS),
-            };
+            let searched = cluster.map_or(target.len(), |points| target.len().min(points));
             MethodCost {
                 bricks: 0,
                 transform_bytes: size_of_val(target),

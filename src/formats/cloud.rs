@@ -170,6 +170,18 @@ pub fn declared_rows(bytes: &[u8], name: Option<&str>) -> Result<usize, FormatEr
     }
 }
 
+/// Bytes that decoding a file holds beside its points: the body of a compressed PCD, which is
+/// decompressed as a whole. The other formats are decompressed piece by piece.
+///
+/// # Errors
+/// As [`declared_rows`].
+pub fn working_bytes(bytes: &[u8], name: Option<&str>) -> Result<u64, FormatError> {
+    match recognize(bytes, name)? {
+        FileKind::Pcd => Pcd::open(bytes)?.unfolded_bytes(),
+        _ => Ok(0),
+    }
+}
+
 fn read_npz(bytes: &[u8], most: usize) -> Result<Vec<Point>, FormatError> {
     let mut npz = Npz::open_within(bytes, most)?;
     if npz.has("pc1") && npz.has("pc2") {

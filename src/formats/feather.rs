@@ -92,8 +92,10 @@ impl<'a> Table<'a> {
         let mut buffer = 0;
         for field in schema.fields().iter().flatten() {
             let name = field.name().unwrap_or_default().to_owned();
-            let (stored, buffers) = layout(&field)
-                .ok_or_else(|| KIND.unsupported(format!("column {} is nested", shorten(&name))))?;
+            let (stored, buffers) = layout(&field).ok_or_else(|| {
+                let name = shorten(&name);
+                KIND.unsupported(format!("column {name} is nested, or holds views of texts"))
+            })?;
             // A numeric column has two buffers: the null bitmap, then the data.
             columns.push(Column {
                 name,
@@ -329,7 +331,8 @@ fn batch_of(message: Message<'_>) -> Result<arrow_ipc::RecordBatch<'_>, FormatEr
         .ok_or_else(|| KIND.malformed("a batch is no record batch"))
 }
 
-/// The storage of a flat column, and its number of buffers. `None` for nested columns.
+/// The storage of a flat column, and its number of buffers. `None` for nested columns, and for views
+/// of texts, whose number of buffers differs from batch to batch.
 fn layout(field: &arrow_ipc::Field<'_>) -> Option<(Stored, usize)> {
     if field.dictionary().is_some() {
         return Some((Stored::Other, 2));
@@ -360,6 +363,7 @@ fn layout(field: &arrow_ipc::Field<'_>) -> Option<(Stored, usize)> {
         _ => None,
     };
     match field.type_type() {
+        Type::Null => Some((Stored::Other, 0)),
         Type::Bool | Type::FloatingPoint | Type::Int => number.map(|stored| (stored, 2)),
         Type::Decimal
         | Type::Date

@@ -45,7 +45,7 @@ pub use crate::formats::boxes::{BoxLayout, BoxSequence, KittiCamera, LayoutFile,
 pub use crate::formats::camera::{KITTI_SIZE_PX, read_camera, read_camera0_from_lidar};
 pub use crate::formats::cloud::{
     Cloud, CloudFormat, TimedCloud, declared_rows, read_cloud, read_cloud_within, read_timed_cloud,
-    write_cloud, write_timed_pcd,
+    working_bytes, write_cloud, write_timed_pcd,
 };
 pub use crate::formats::dense_file::{DENSE_FORMATS, DenseFormat, is_dense, write_dense};
 pub use crate::formats::depth_png::{read_depth_png, write_depth_png};

@@ -144,7 +144,7 @@ impl<'a> Pcd<'a> {
             }
             return Ok(());
         }
-        let stride = self.sum(|field| field.scalar.size().saturating_mul(field.count))?;
+        let stride = self.stride()?;
         let offsets = self.offsets(&indices, |field| field.scalar.size() * field.count);
         let data = self.data(stride)?;
         for row in 0..self.rows {
@@ -165,12 +165,33 @@ impl<'a> Pcd<'a> {
         Ok(())
     }
 
+    /// Bytes of the body once it is decompressed; zero where it is not compressed.
+    pub(super) fn unfolded_bytes(&self) -> Result<u64, FormatError> {
+        if self.encoding != Encoding::Compressed {
+            return Ok(0);
+        }
+        Ok(self.packed(self.stride()?)?.1 as u64)
+    }
+
+    /// Bytes of a point in a binary body.
+    fn stride(&self) -> Result<usize, FormatError> {
+        self.sum(|field| field.scalar.size().saturating_mul(field.count))
+    }
+
     /// The binary body, decompressed where it is compressed.
     fn data(&self, stride: usize) -> Result<Cow<'a, [u8]>, FormatError> {
         if self.encoding == Encoding::Binary {
             check_size(KIND, self.rows, stride, self.body.len())?;
             return Ok(Cow::Borrowed(self.body));
         }
+        let (packed, unfolded_len) = self.packed(stride)?;
+        lzf::decompress(packed, unfolded_len)
+            .map(Cow::Owned)
+            .map_err(|detail| KIND.malformed(format!("compressed data: {detail}")))
+    }
+
+    /// The compressed body, and its length once it is decompressed.
+    fn packed(&self, stride: usize) -> Result<(&'a [u8], usize), FormatError> {
         let early = || KIND.malformed("the compressed data ends early");
         let (packed_len, rest) = self.body.split_first_chunk::<4>().ok_or_else(early)?;
         let (unfolded_len, rest) = rest.split_first_chunk::<4>().ok_or_else(early)?;
@@ -189,9 +210,7 @@ impl<'a> Pcd<'a> {
                 "the data unfolds to {unfolded_len} bytes, far more than a file of this length holds"
             )));
         }
-        lzf::decompress(packed, unfolded_len)
-            .map(Cow::Owned)
-            .map_err(|detail| KIND.malformed(format!("compressed data: {detail}")))
+        Ok((packed, unfolded_len))
     }
 
     fn indices(&self, wanted: &[&str]) -> Result<Vec<usize>, FormatError> {

@@ -68,10 +68,23 @@ impl SweepTime {
     ///
     /// A timestamp is a run of digits between the last path separator and the first dot of the file
     /// name. 18 or 19 digits are nanoseconds, 16 microseconds, 13 milliseconds. The last of several
-    /// timestamps is used.
+    /// timestamps is used. Ten digits, a dot and nine digits are seconds and nanoseconds, as ROS
+    /// writes them.
     pub fn from_name(name: &str) -> Option<Self> {
         let file = name.rsplit(['/', '\\']).next()?;
-        let stem = file.split('.').next()?;
+        let mut parts = file.split('.');
+        let stem = parts.next()?;
+        let is_fraction = |part: &&str| part.len() == 9 && part.bytes().all(|b| b.is_ascii_digit());
+        if let Some(fraction) = parts.next().filter(is_fraction) {
+            let digits = stem.len() - stem.trim_end_matches(|l: char| l.is_ascii_digit()).len();
+            if digits == 10 {
+                let ticks = format!("{}{fraction}", &stem[stem.len() - digits..]);
+                return Some(Self {
+                    ticks: ticks.parse().ok()?,
+                    unit: TimeUnit::Nanoseconds,
+                });
+            }
+        }
         let runs = stem.split(|letter: char| !letter.is_ascii_digit());
         let mut found = runs.filter_map(|digits| {
             let unit = match digits.len() {
@@ -119,6 +132,12 @@ mod tests {
                 Some(0.049_78),
             ),
             ("1700000000200.ply", "1700000000100.ply", Some(0.1)),
+            (
+                "scan_1617179420.100000000.pcd",
+                "scan_1617179420.150000000.pcd",
+                Some(0.05),
+            ),
+            ("1617179420.1.pcd", "1617179420.2.pcd", None),
             ("0000000011.pcd", "0000000012.pcd", None),
             ("1700000000200.ply", "1700000000200.ply", None),
             ("1700000000200.ply", "1800000000200.ply", None),

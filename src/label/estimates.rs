@@ -30,8 +30,8 @@ pub(super) enum Tracking {
     NotBegun,
     /// All pairs so far have an estimate.
     Begun(Box<Tracker>),
-    /// A pair is refused: the tracks end before it, and are written.
-    Ended,
+    /// A pair is refused: the tracks end before it. They are written at the end of the drive.
+    Ended(Box<Output>),
     /// A pair of this drive has failed. The next run begins the drive again, so that its tracks and
     /// flows do not depend on whether a store failed for a while.
     Failed(usize),
@@ -62,13 +62,15 @@ impl Estimates<'_> {
                 return;
             }
             if inputs.tracks {
-                let tracking = std::mem::replace(&mut self.tracking, Tracking::Ended);
-                self.write_tracks_of(wanted.drive, tracking);
+                let tracks = self.tracks_of(wanted.drive);
+                self.tracking = tracks.map_or(Tracking::NotBegun, Tracking::Ended);
             }
         }
-        if inputs.tracks && wanted.pair + 1 == drive.pairs() {
-            let tracking = std::mem::take(&mut self.tracking);
-            self.write_tracks_of(wanted.drive, tracking);
+        if inputs.tracks
+            && wanted.pair + 1 == drive.pairs()
+            && let Some(tracks) = self.tracks_of(wanted.drive)
+        {
+            let _the_writer_is_there = self.outputs.send(*tracks);
         }
     }
 
@@ -194,36 +196,43 @@ impl Estimates<'_> {
         mask: Option<&[bool]>,
         report: RowReport,
     ) {
+        let is_gap = wanted.before == Before::Gap;
+        let drive = &self.io.inputs.plan.drives()[wanted.drive];
         let output = Output {
+            drive: wanted.drive,
             path: wanted.path.clone(),
             replaces: wanted.before == Before::Untracked,
+            removes: is_gap.then(|| tracks_path(&drive.name)),
             bytes: self.io.inputs.layout.bytes(source, estimate, mask),
             report: report.with(estimate),
         };
         let _the_writer_is_there = self.outputs.send(output);
     }
 
-    /// Writes the tracks of a drive, unless they have been written at their end. Those of an earlier
-    /// run, which could not label a pair, are replaced.
-    fn write_tracks_of(&self, drive: usize, tracking: Tracking) {
-        let tracker = match tracking {
+    /// The tracks of a drive, and begins anew; none where a pair of the drive has failed. They replace
+    /// those of an earlier run, which could not label a pair.
+    fn tracks_of(&mut self, drive: usize) -> Option<Box<Output>> {
+        let tracker = match std::mem::take(&mut self.tracking) {
             Tracking::NotBegun => Tracker::default(),
             Tracking::Begun(tracker) => *tracker,
-            Tracking::Ended | Tracking::Failed(_) => return,
+            Tracking::Ended(tracks) => return Some(tracks),
+            Tracking::Failed(_) => return None,
         };
         let name = &self.io.inputs.plan.drives()[drive].name;
         let mut bytes = Vec::new();
         let written = write_tracks(&tracker.finish(), &mut bytes);
         let path = tracks_path(name);
-        let _the_writer_is_there = self.outputs.send(Output {
+        Some(Box::new(Output {
             report: RowReport {
                 tracks: true,
                 ..RowReport::new(path.clone(), name, name)
             },
+            drive,
             path,
             replaces: true,
+            removes: None,
             bytes: written.map(|()| bytes),
-        });
+        }))
     }
 }
 

@@ -67,16 +67,18 @@ pub fn finalize(
         check_outputs(plan, layout, settings.tracks)?;
         output.remove_cut_off(CUT_OFF)?;
         let all: HashSet<String> = output.all("").await?.into_iter().collect();
-        let mut reports: HashMap<String, RowReport> = HashMap::new();
+        // The latest report of each pair, and the latest that tells of its output.
+        let mut latest: HashMap<String, RowReport> = HashMap::new();
+        let mut labelled: HashMap<String, RowReport> = HashMap::new();
         // The names begin with the time of the attempt.
         let is_part = |path: &&String| path.starts_with("_report/");
         let parts: BTreeSet<&String> = all.iter().filter(is_part).collect();
         for part in parts {
             for report in read_lines(&output.read(part).await?) {
-                let known = reports.get(&report.key).is_some_and(RowReport::is_there);
-                if !known || report.is_there() {
-                    reports.insert(report.key.clone(), report);
+                if report.is_there() {
+                    labelled.insert(report.key.clone(), report.clone());
                 }
+                latest.insert(report.key.clone(), report);
             }
         }
         let mut found = Finalized::default();
@@ -92,10 +94,11 @@ pub fn finalize(
         for (drive, pair) in plan.all_pairs().filter(|&(_, pair)| layout.asks_for(pair)) {
             let of = &plan.drives()[drive];
             let key = of.key(pair);
-            let report = reports.get(&key);
             let is_there = all.contains(&layout.path(&of.name, pair, &key))
                 && (!whole || all.contains(&tracks_path(&of.name)));
-            let refused = report.filter(|report| report.outcome == Outcome::Refused);
+            let last = latest.get(&key);
+            let report = labelled.get(&key).filter(|_| is_there).or(last);
+            let refused = last.filter(|report| report.outcome == Outcome::Refused);
             found.pairs += 1;
             let outcome = match (is_there, refused) {
                 (true, _) => {

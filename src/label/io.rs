@@ -34,8 +34,11 @@ pub(super) enum Before {
     Nothing,
     /// The output: the pair is computed for the tracks of its drive alone.
     Output,
-    /// An output without the motions of tracks, because a pair before it could not be labelled: it is
-    /// replaced.
+    /// Nothing, because an earlier run could not label the pair: the tracks of its drive end before it.
+    /// They are removed before its output is written.
+    Gap,
+    /// An output that may lack the motions of tracks: a pair before it was not labelled, or its drive
+    /// has no tracks yet. It is replaced.
     Untracked,
 }
 
@@ -58,9 +61,13 @@ pub(super) struct Unread {
 
 /// An output to be written.
 pub(super) struct Output {
+    /// The index of its drive.
+    pub(super) drive: usize,
     pub(super) path: String,
     /// Whether it replaces an output that is there.
     pub(super) replaces: bool,
+    /// A file that is removed before.
+    pub(super) removes: Option<String>,
     pub(super) bytes: Result<Vec<u8>, FormatError>,
     pub(super) report: RowReport,
 }
@@ -127,6 +134,12 @@ impl Io<'_> {
             Ok(bytes) => Bytes::from(bytes),
         };
         let place = &self.inputs.output;
+        if let Some(path) = &output.removes {
+            match self.patiently(|| self.runtime.block_on(place.remove(path))) {
+                Ok(()) | Err(PlaceError::Missing(_)) => {}
+                Err(error) => return output.report.ended(Outcome::Failed, &error),
+            }
+        }
         let put = || {
             let (path, bytes) = (&output.path, bytes.clone());
             self.runtime.block_on(async {

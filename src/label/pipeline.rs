@@ -8,8 +8,9 @@ use std::thread;
 
 use super::error::LabelError;
 use super::estimates::{Estimates, Tracking};
-use super::io::{At, Io, Loaded, Unread, Wanted};
+use super::io::{At, Io, Loaded, Output, Unread, Wanted};
 use super::places::Places;
+use super::report::Outcome;
 use super::tally::Tally;
 use super::types::{Done, Solver, Told};
 use crate::flow::{Control, window};
@@ -29,14 +30,26 @@ pub(super) fn label(
     told: &mut dyn FnMut(&Told),
 ) -> Result<Done, LabelError> {
     let (sweeps, read) = sync_channel(AHEAD);
-    let (outputs, to_write) = sync_channel(BEHIND);
+    let (outputs, to_write) = sync_channel::<Output>(BEHIND);
     let (reports, reported) = channel();
     thread::scope(|scope| {
         scope.spawn(move || read_ahead(io, wanted, &sweeps));
         let written = reports.clone();
         scope.spawn(move || {
+            let mut failed = None;
             while let Ok(output) = to_write.recv() {
-                let _the_tally_is_there = written.send(io.write(output));
+                let drive = output.drive;
+                // Tracks say that all outputs before them are there: the next run begins the drive again.
+                let report = if io.inputs.tracks && failed == Some(drive) {
+                    let reason = "another output of its drive was not written";
+                    output.report.ended(Outcome::Failed, &reason)
+                } else {
+                    io.write(output)
+                };
+                if report.outcome == Outcome::Failed {
+                    failed = Some(drive);
+                }
+                let _the_tally_is_there = written.send(report);
             }
         });
         let mut estimates = Estimates {

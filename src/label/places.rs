@@ -1,7 +1,7 @@
 //! Places of files: paths of this machine, and URIs of object stores.
 
 use std::collections::HashMap;
-use std::fs::OpenOptions;
+use std::fs::{self, OpenOptions};
 use std::io::{self, ErrorKind, Read};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
@@ -223,10 +223,21 @@ impl Place {
         read.map_err(|error| PlaceError::new(&self.uri(below), error))
     }
 
-    /// The names of the folders and of the files directly below a path, each in order.
+    /// The names of the folders and of the files directly below a path, each in order. A folder of this
+    /// machine that must not be read is [`PlaceError::Unusable`].
     pub(super) async fn entries(&self, below: &str) -> Result<[Vec<String>; 2], PlaceError> {
-        let found = self.objects.entries(&self.path(below)).await;
-        found.map_err(|error| PlaceError::new(&self.uri(below), error))
+        let uri = self.uri(below);
+        if self.base.contains("://") {
+            let found = self.objects.entries(&self.path(below)).await;
+            return found.map_err(|error| PlaceError::new(&uri, error));
+        }
+        folder_entries(Path::new(&uri)).map_err(|error| match error.kind() {
+            ErrorKind::PermissionDenied => PlaceError::Unusable {
+                source: error.into(),
+                uri,
+            },
+            _ => PlaceError::new(&uri, error.into()),
+        })
     }
 
     /// The relative paths of all files below a path.
@@ -269,6 +280,30 @@ impl Place {
         let removed = self.objects.remove(&self.path(below)).await;
         removed.map_err(|error| PlaceError::new(&self.uri(below), error))
     }
+}
+
+/// The names of the folders and of the files in a folder of this machine, each in order; none if there
+/// is no such folder. Links are what they lead to, and files where they lead nowhere.
+fn folder_entries(folder: &Path) -> io::Result<[Vec<String>; 2]> {
+    let (mut folders, mut files) = (Vec::new(), Vec::new());
+    let listed = match fs::read_dir(folder) {
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok([folders, files]),
+        listed => listed?,
+    };
+    for entry in listed {
+        let entry = entry?;
+        let name = entry.file_name().into_string().map_err(|name| {
+            let message = format!("the name {} is no UTF-8", name.display());
+            io::Error::new(ErrorKind::InvalidFilename, message)
+        })?;
+        match fs::metadata(entry.path()).is_ok_and(|about| about.is_dir()) {
+            true => folders.push(name),
+            false => files.push(name),
+        }
+    }
+    folders.sort();
+    files.sort();
+    Ok([folders, files])
 }
 
 #[cfg(test)]

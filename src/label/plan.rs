@@ -180,10 +180,12 @@ pub(super) fn drive_name(path: &str) -> String {
     parts.map(key_of).collect::<Vec<_>>().join("/")
 }
 
-/// The name of a file without its folder and without everything from its first dot.
+/// The name of a file without its folder and its ending. nuScenes has two endings, `.pcd.bin`.
 pub(super) fn stem(name: &str) -> &str {
     let file = name.rsplit(['/', '\\']).next().unwrap_or(name);
-    file.split('.').next().unwrap_or(file)
+    let bare = file.strip_suffix(".pcd.bin");
+    bare.or(file.rsplit_once('.').map(|(bare, _)| bare))
+        .unwrap_or(file)
 }
 
 #[cfg(test)]
@@ -229,6 +231,13 @@ mod tests {
             names,
             ["a_b", ".._x", "x..", "x_SUCCESS", "x_bung", "7.pcd.bin"]
         );
-        assert_eq!(stem("a/b/0012.pcd.bin"), "0012");
+        let names = [
+            "a/b/0012.pcd.bin",
+            "1617179420.100000000.pcd",
+            "scan.0001.ply",
+            "7",
+        ]
+        .map(stem);
+        assert_eq!(names, ["0012", "1617179420.100000000", "scan.0001", "7"]);
     }
 }

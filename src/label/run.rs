@@ -116,7 +116,8 @@ async fn wanted(inputs: &Inputs<'_>) -> Result<(usize, Vec<Wanted>), LabelError>
 
 /// What is to be computed of a drive whose tracks are wanted: nothing if all of it is there, and
 /// otherwise all pairs, because tracks need them. Where there are tracks and a pair is missing, the pair
-/// was refused, the tracks end before it, and the flows after it are without them.
+/// was refused, the tracks end before it, and the flows after it are without them. Where there are no
+/// tracks, an earlier run was interrupted, perhaps between flows with and without them.
 fn of_tracked_drive(pairs: &[Wanted], has_tracks: bool) -> Vec<Wanted> {
     let missing = pairs
         .iter()
@@ -125,8 +126,12 @@ fn of_tracked_drive(pairs: &[Wanted], has_tracks: bool) -> Vec<Wanted> {
         return Vec::new();
     }
     let mut pairs = pairs.to_vec();
-    let after = missing.filter(|_| has_tracks).unwrap_or(pairs.len());
-    for wanted in &mut pairs[after..] {
+    let mut first = 0;
+    if let Some(gap) = missing.filter(|_| has_tracks) {
+        pairs[gap].before = Before::Gap;
+        first = gap;
+    }
+    for wanted in &mut pairs[first..] {
         if wanted.before == Before::Output {
             wanted.before = Before::Untracked;
         }

@@ -216,8 +216,14 @@ impl Metrics {
     /// - `fnsf_queue_work_seconds`: `work_seconds`, the predicted compute time of all queued jobs
     ///   if one lane did them all.
     /// - `fnsf_queue_oldest_seconds`: `oldest`, the time since the oldest queued job became ready.
+    ///   NaN if it is not known.
     /// - `fnsf_jobs_running`: the running jobs of `backlog`.
-    pub fn backlog(&self, backlog: &crate::queue::Backlog, work_seconds: f64, oldest: Duration) {
+    pub fn backlog(
+        &self,
+        backlog: &crate::queue::Backlog,
+        work_seconds: f64,
+        oldest: Option<Duration>,
+    ) {
         for priority in Priority::ALL {
             let label = Urgency {
                 priority: priority.name(),
@@ -226,7 +232,8 @@ impl Metrics {
             self.queue_depth.get_or_create(&label).set(jobs as i64);
         }
         self.queue_work_seconds.set(work_seconds);
-        self.queue_oldest_seconds.set(oldest.as_secs_f64());
+        let oldest = oldest.map_or(f64::NAN, |oldest| oldest.as_secs_f64());
+        self.queue_oldest_seconds.set(oldest);
         self.running.set(backlog.running().jobs as i64);
     }
 

@@ -56,8 +56,8 @@ pub struct TopDown<'a> {
 pub struct TopDownOptions {
     /// Width and height, pixels, clamped to 256..=8192.
     pub side_px: u32,
-    /// Half the width of the visible square, metres. A value that is not positive and finite counts
-    /// as none.
+    /// Half the width of the visible square, metres, clamped to 1..=10,000. A value that is not
+    /// positive and finite counts as none.
     ///
     /// If none, it is the smallest of 10, 20, 30, 40, 50, 60, 80, 100, 150 and 200 m that holds
     /// 93 % of the points with a flow. It is 200 m if none of these does, and 50 m without such
@@ -130,7 +130,7 @@ pub fn top_down(scene: &TopDown<'_>, options: &TopDownOptions) -> Image {
     let range_m = options
         .range_m
         .filter(|range| *range > 0.0 && range.is_finite());
-    let range_m = range_m.unwrap_or_else(|| choose_range(scene));
+    let range_m = range_m.map_or_else(|| choose_range(scene), |range| range.clamp(1.0, 10_000.0));
     let view = View {
         side: side as f32,
         range_m,

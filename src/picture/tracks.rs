@@ -115,6 +115,9 @@ fn draw_track(image: &mut Image, view: View, scene: &TracksFromAbove<'_>, track:
             color,
         );
         let [x, y] = view.pixel(a);
+        if ![x, y].iter().all(|at| (0.0..view.side).contains(at)) {
+            return;
+        }
         let dot = view.small_dot();
         let style = TextStyle {
             dot,

@@ -22,7 +22,7 @@ pub enum NotDelivered {
     #[error("the URI {0}")]
     NotAllowed(#[from] NotAllowed),
     /// The bucket refuses the object or does not answer.
-    #[error("the bucket cannot be written")]
+    #[error("the bucket cannot be written: {0}")]
     Failed(#[from] BlobError),
 }
 

@@ -212,6 +212,33 @@ fn a_reader_that_goes_away_is_no_failure() {
 }
 
 #[test]
+fn files_are_written_though_the_reader_of_the_lines_goes_away() {
+    use std::process::{Command, Stdio};
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    street(folder, "4");
+    let sweeps = (0..4).map(|sweep| format!("street/sweep_{sweep:04}.pcd"));
+    let mut child = Command::new(env!("CARGO_BIN_EXE_fnsf"))
+        .current_dir(folder)
+        .arg("flow")
+        .args(sweeps)
+        .args(["-o", "flow.npz"])
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("the program starts");
+    drop(child.stdout.take());
+    let ended = child.wait_with_output().expect("the child is ours");
+    assert!(ended.status.success(), "{ended:?}");
+    let written = std::fs::read_dir(folder).expect("a folder");
+    let written = written.filter(|file| {
+        let name = file.as_ref().expect("a file").file_name();
+        name.to_string_lossy().ends_with(".npz")
+    });
+    assert_eq!(written.count(), 3);
+}
+
+#[test]
 fn clouds_far_from_the_origin_align_as_near_ones_do() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();

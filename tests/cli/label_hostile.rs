@@ -59,8 +59,24 @@ fn names_and_files_that_cannot_work_are_refused_and_do_not_hang() {
     assert_eq!(refused.code, 2, "{}", refused.stderr);
 
     // Links multiply nothing.
-    for name in ["up1", "up2"] {
-        std::os::unix::fs::symlink("..", folder.join("drives").join(name)).expect("a link");
+    for (to, name) in [
+        ("..", "up1"),
+        ("..", "up2"),
+        (".", "latest"),
+        (".", "d0/self"),
+        ("nowhere", "d0/gone"),
+    ] {
+        std::os::unix::fs::symlink(to, folder.join("drives").join(name)).expect("a link");
+    }
+    // What a file system keeps for itself is no drive.
+    fs::create_dir(folder.join("drives/lost+found")).expect("a folder");
+    for sweep in 0..2 {
+        let name = format!("sweep_{sweep:04}.pcd");
+        let (from, to) = (
+            folder.join("drives/d0").join(&name),
+            folder.join("drives/lost+found").join(name),
+        );
+        fs::copy(from, to).expect("copied");
     }
     let done = label(folder, &["drives", "-o", "linked"]);
     assert!(

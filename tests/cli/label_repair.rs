@@ -43,6 +43,47 @@ fn a_mended_sweep_gives_the_tracks_and_the_flows_of_a_drive_without_fault() {
 }
 
 #[test]
+fn a_repair_that_is_interrupted_is_done_by_the_next_run() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    drives(folder, 1, "8");
+    let run = |output: &str, more: &[&str]| {
+        let tracked = ["drives", "-o", output, "--tracks", "--preset", "default"];
+        label(folder, &[&tracked[..], more].concat())
+    };
+    assert_eq!(run("reference", &[]).code, 0);
+    let [damaged, away] =
+        ["0002", "0006"].map(|sweep| folder.join(format!("drives/d0/sweep_{sweep}.pcd")));
+    let [sound, other] = [&damaged, &away].map(|path| fs::read(path).expect("written"));
+    fs::write(&damaged, &sound[..sound.len() / 2]).expect("writable");
+    assert_eq!(run("labels", &[]).code, 65);
+    // The sweep is mended, and the store fails in the middle of the repair.
+    fs::write(&damaged, &sound).expect("writable");
+    fs::remove_file(&away).expect("there");
+    let socket = UnixListener::bind(&away).expect("a socket");
+    let failed = run("labels", &[]);
+    assert_eq!(failed.code, 75, "{}", failed.stderr);
+    assert_eq!(run("labels", &["--finalize"]).code, 75, "a pair is missing");
+    drop(socket);
+    fs::remove_file(&away).expect("there");
+    fs::write(&away, &other).expect("writable");
+    let repaired = run("labels", &[]);
+    assert_eq!(repaired.code, 0, "{}", repaired.stderr);
+    let [reference, found] = ["reference", "labels"].map(|name| labels(&folder.join(name)));
+    assert_same(&found, &reference);
+    assert_eq!(run("labels", &["--finalize"]).code, 0);
+
+    // A label that is deleted, and whose sweep is then damaged, is refused and not missing.
+    fs::remove_file(folder.join("labels/d0/sweep_0006.npz")).expect("there");
+    fs::remove_file(folder.join("labels/d0/tracks.json")).expect("there");
+    fs::write(folder.join("drives/d0/sweep_0007.pcd"), "no cloud").expect("writable");
+    assert_eq!(run("labels", &[]).code, 65);
+    let end = run("labels", &["--finalize"]);
+    assert_eq!(end.code, 0, "{}", end.stderr);
+    assert!(end.stdout.contains("refused"), "{}", end.stdout);
+}
+
+#[test]
 fn a_store_that_fails_for_a_while_changes_no_tracks_and_no_flows() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();

@@ -122,6 +122,33 @@ fn missing_values_in_a_feather_column_are_refused() {
 }
 
 #[test]
+fn feather_columns_beside_the_coordinates_are_left_alone() {
+    use std::sync::Arc;
+
+    use arrow_array::{ArrayRef, Float32Array, NullArray, RecordBatch, StringArray};
+    let axis = |value: f32| -> ArrayRef { Arc::new(Float32Array::from(vec![value, value + 1.0])) };
+    let batch = RecordBatch::try_from_iter([
+        ("x", axis(0.0)),
+        ("nothing", Arc::new(NullArray::new(2)) as ArrayRef),
+        ("y", axis(10.0)),
+        (
+            "note",
+            Arc::new(StringArray::from(vec!["a", "b"])) as ArrayRef,
+        ),
+        ("z", axis(20.0)),
+    ]);
+    let batch = batch.expect("columns of one length");
+    let mut bytes = Vec::new();
+    let writer = arrow_ipc::writer::FileWriter::try_new(&mut bytes, &batch.schema());
+    let mut writer = writer.expect("a writer");
+    writer.write(&batch).expect("written");
+    writer.finish().expect("finished");
+    drop(writer);
+    let cloud = read_cloud(&bytes, Some("cloud.feather")).expect("a cloud");
+    assert_eq!(cloud.points, [[0.0, 10.0, 20.0], [1.0, 11.0, 21.0]]);
+}
+
+#[test]
 fn a_pair_whose_parts_disagree_is_refused() {
     let cloud = |rows: usize| {
         npy(

@@ -106,6 +106,19 @@ fn a_pair_that_fails_costs_no_other_that_was_there_before_it() {
 }
 
 #[test]
+fn a_sweep_of_another_scene_before_a_cut_changes_no_flow_after_it() {
+    let (_, after) = drive(0, 3, 32);
+    let (_, before) = drive(77, 1, 32);
+    let expected = alone(&after, 0, &seeing(5), &Uncontrolled);
+    let joined = [before, after].concat();
+    let found = alone(&joined, 1, &seeing(5), &Uncontrolled);
+    assert_eq!(found.flow, expected.flow);
+    // Its own sweeps do change it.
+    let alone_of_two = alone(&joined[1..3], 0, &seeing(5), &Uncontrolled);
+    assert_ne!(found.objects(), alone_of_two.objects());
+}
+
+#[test]
 fn how_many_sweeps_a_pair_sees_is_fixed_by_the_first_one() {
     let (_, sweeps) = drive(0, 6, 16);
     let backend = CpuBackend::new(Some(2)).expect("threads");

@@ -14,7 +14,7 @@ use crate::raw_http::Besieged;
 use crate::server::Server;
 
 /// Posts two files with a preset. Returns the flow, or the problem document.
-async fn post(
+pub(crate) async fn post(
     server: &Server,
     [source, target]: [&[u8]; 2],
     preset: &str,

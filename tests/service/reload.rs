@@ -3,7 +3,11 @@
 use std::path::PathBuf;
 
 use reqwest::{Client, StatusCode};
+use tokio_stream::StreamExt;
+use tonic::Code;
 
+use crate::clouds::{accepted, form, small_pair};
+use crate::grpc::{self, proto};
 use crate::server::{Folder, Server};
 
 const OLD: &str = "an-old-key-of-a-tenant";
@@ -46,4 +50,50 @@ async fn keys_are_exchanged_without_a_restart_and_two_are_valid_while_they_rotat
         reload(&server, &file, wrong, "stay as they were");
         assert_eq!(both(&server).await, (no, ok));
     }
+}
+
+#[tokio::test]
+async fn streams_of_events_end_with_the_key_of_their_reader() {
+    let folder = Folder::new();
+    let server = Server::start_in(&folder, &config(&[OLD, NEW]), &[]);
+    let long = r#"{"preset": "paper", "field": {"max_iterations": 1000000, "patience": 1000000}}"#;
+    let job = Client::new()
+        .post(server.url("/v1/jobs"))
+        .multipart(form(small_pair(), long))
+        .bearer_auth(NEW);
+    let job = accepted(job).await;
+    let id = job["id"].as_str().expect("an id").to_owned();
+    let http = async |key: &str| {
+        let path = format!("/v1/jobs/{id}/events");
+        let events = Client::new().get(server.url(&path)).bearer_auth(key).send();
+        events.await.expect("an answer").bytes_stream()
+    };
+    let (mut old, mut new) = (http(OLD).await, http(NEW).await);
+    let mut asked = tonic::Request::new(proto::WatchJobRequest { id: id.clone() });
+    let bearer = format!("Bearer {OLD}").parse().expect("a header");
+    asked.metadata_mut().insert("authorization", bearer);
+    let watch = grpc::client(&server).await.watch_job(asked).await;
+    let mut watch = watch.expect("news").into_inner();
+
+    let file = folder.path().join("fnsf.toml");
+    reload(&server, &file, &config(&[NEW]), "are read again");
+    while let Some(event) = old.next().await {
+        event.expect("the stream ends as a whole");
+    }
+    let refused = loop {
+        match watch.next().await.expect("an end that says why") {
+            Ok(_job) => {}
+            Err(status) => break status,
+        }
+    };
+    assert_eq!(refused.code(), Code::Unauthenticated);
+    // The other reader still gets news of the same job.
+    let delete = server.url(&format!("/v1/jobs/{id}"));
+    let ended = Client::new().delete(delete).bearer_auth(NEW).send().await;
+    assert!(ended.expect("an answer").status().is_success());
+    let mut text = String::new();
+    while let Some(event) = new.next().await {
+        text += &String::from_utf8_lossy(&event.expect("an event"));
+    }
+    assert!(text.contains("\"cancelled\""), "{text}");
 }

@@ -17,8 +17,10 @@ from server import Node
 PERIOD = 2.0
 # Counting files and rows costs more.
 STORE_EVERY = 6
-# Payloads of interrupted uploads are removed one to two hours later; docs/operations.md says so.
+# Payloads of interrupted uploads are removed one to two hours later, by a server that has run for five minutes;
+# docs/operations.md says so.
 ORPHAN_SECONDS = 2 * 3600 + 600
+SEARCHED_SECONDS = 360
 
 
 def of_process(pid: int) -> dict[str, int]:
@@ -155,7 +157,7 @@ class Sampler(threading.Thread):
     def orphan(self, job: str) -> None:
         """Payloads without a job that are older than documented, told once each."""
         told: list[str] = self.soak.state.totals.setdefault("old_orphans", [])
-        if job not in told:
+        lives = [round(time.time() - node.started) for node in self.soak.nodes]
+        if job not in told and max(lives) > SEARCHED_SECONDS:
             told.append(job)
-            lives = [round(time.time() - node.started) for node in self.soak.nodes]
             self.soak.state.violation("payload without a job", job=job, seconds_since_start=lives)

@@ -115,6 +115,16 @@ def test_a_row_that_cannot_be_written_does_not_stop_the_others(table, tmp_path):
     assert Labeller(str(tmp_path / "labels"))(table)["outcome"][1] == "refused"
 
 
+def test_a_key_with_percent_signs_is_a_name_below_the_output(table, tmp_path):
+    for output in (str(tmp_path / "labels"), f"file://{tmp_path}/labels"):
+        for key in ("%2e%2e/%2e%2e/outside", "a%2Fb", "a%41", "Übung 7"):
+            table["key"][1] = key
+            report = Labeller(output, preset="default")(table)
+            assert report["outcome"][1] in ("labelled", "found"), (output, key, report["error"][1])
+            assert (tmp_path / "labels" / f"{key}.npz").is_file()
+    assert {path.name for path in tmp_path.iterdir() if path.name.startswith(("outside", "labels"))} == {"labels"}
+
+
 def test_racing_writers_leave_one_label(table, tmp_path):
     outcomes = []
     labeller = Labeller(str(tmp_path / "labels"), ending="feather")

@@ -15,6 +15,7 @@ use super::{chunks, convert, requests, sequence};
 use crate::api::admission::Durability;
 use crate::api::dense;
 use crate::api::error::ApiError;
+use crate::api::job_watch::JobWatch;
 use crate::api::listener::Asking;
 use crate::api::pending_job::{Accepted, PendingJob};
 use crate::api::result_budget::ReadProgress;
@@ -375,12 +376,13 @@ impl SceneFlow for Calls {
     ) -> Result<Response<Self::WatchJobStream>, Status> {
         let call = Call::of(&request)?;
         let id = named(&request.get_ref().id)?;
-        let mut news = self.service.watch(&call.caller, id).await?;
-        let closing = self.service.closing.clone();
+        let shown = request.metadata().get("authorization");
+        let shown = shown.and_then(|value| value.to_str().ok());
+        let mut watch = JobWatch::begin(&self.service, &call.caller, shown, id).await?;
         let (answers, stream) = mpsc::channel(AHEAD);
         tokio::spawn(async move {
             loop {
-                let job = Arc::clone(&news.borrow_and_update());
+                let job = watch.latest();
                 let shown = convert::job_for(&call.caller, &job);
                 let sent = answers.send(Ok(shown)).await;
                 if sent.is_err() || job.state.is_end() {
@@ -388,11 +390,10 @@ impl SceneFlow for Calls {
                 }
                 tokio::select! {
                     () = answers.closed() => return,
-                    () = closing.cancelled() => {
-                        let _gone_is_fine = answers.send(Err(ApiError::Draining.into())).await;
+                    changed = watch.changed() => if let Err(error) = changed {
+                        let _gone_is_fine = answers.send(Err(error.into())).await;
                         return;
                     }
-                    changed = news.changed() => if changed.is_err() { return },
                 }
             }
         });

@@ -5,27 +5,27 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use axum::extract::{Extension, State};
+use axum::http::{HeaderMap, header};
 use axum::response::sse::{Event, KeepAlive, Sse};
 use futures_util::Stream;
 use futures_util::stream;
-use tokio::sync::watch;
 
 use super::named::Named;
 use super::problem::Problem;
 use super::view::JobView;
 use crate::api::auth::Caller;
 use crate::api::error::ApiError;
+use crate::api::job_watch::JobWatch;
 use crate::api::service::Service;
-use crate::job::{Job, State as JobState};
+use crate::job::State as JobState;
 
 /// Interval of keep-alive comments, so that proxies do not close an idle stream.
 const HEARTBEAT: Duration = Duration::from_secs(15);
 
 /// The state of an event stream.
 struct Told {
-    service: Arc<Service>,
     caller: Caller,
-    news: watch::Receiver<Arc<Job>>,
+    watch: JobWatch,
     last: Option<(JobState, u32, u32)>,
     ended: bool,
 }
@@ -33,8 +33,8 @@ struct Told {
 /// Streams the state changes and the progress of a job as server-sent events.
 ///
 /// A `state` event contains the job, a `progress` event its progress. The stream begins with the
-/// current state of the job, so a client can reconnect at any time. It ends when the job ends, or
-/// when the server shuts down.
+/// current state of the job, so a client can reconnect at any time. It ends when the job ends, when
+/// the key or the link of the reader is no longer valid, or when the server shuts down.
 #[utoipa::path(
     get,
     path = "/v1/jobs/{id}/events",
@@ -49,12 +49,14 @@ pub(super) async fn follow_job(
     State(service): State<Arc<Service>>,
     Extension(caller): Extension<Caller>,
     Named(id): Named,
+    headers: HeaderMap,
 ) -> Result<Sse<impl Stream<Item = Result<Event, Infallible>>>, ApiError> {
-    let news = service.watch(&caller, id).await?;
+    let shown = headers.get(header::AUTHORIZATION);
+    let shown = shown.and_then(|value| value.to_str().ok());
+    let watch = JobWatch::begin(&service, &caller, shown, id).await?;
     let told = Told {
-        service,
         caller,
-        news,
+        watch,
         last: None,
         ended: false,
     };
@@ -62,19 +64,15 @@ pub(super) async fn follow_job(
     Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(HEARTBEAT)))
 }
 
-/// The next event. `None` after the end of the job, or when the server closes its streams.
+/// The next event. `None` after the end of the job, or when the subscription ends.
 async fn next(mut told: Told) -> Option<(Result<Event, Infallible>, Told)> {
     if told.ended {
         return None;
     }
     if told.last.is_some() {
-        let closing = told.service.closing.clone();
-        tokio::select! {
-            () = closing.cancelled() => return None,
-            changed = told.news.changed() => changed.ok()?,
-        }
+        told.watch.changed().await.ok()?;
     }
-    let job = Arc::clone(&told.news.borrow_and_update());
+    let job = told.watch.latest();
     let now = (job.state, job.attempt, job.pairs_left);
     let same_state = told.last == Some(now);
     told.last = Some(now);

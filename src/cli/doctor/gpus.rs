@@ -6,7 +6,7 @@ use std::time::Instant;
 use super::missing::Environment;
 use crate::cli::device::{best_card, software_is_welcome};
 use crate::cli::failure::Failure;
-use crate::cli::output::say;
+use crate::cli::output::show;
 use crate::engine::self_test_backend;
 use crate::flow::Preset;
 use crate::flow::gpu;
@@ -16,31 +16,31 @@ use crate::flow::gpu::{Adapter, AdapterKind, Gpu, GpuOptions};
 pub(super) fn report() -> Result<(), Failure> {
     let adapters = gpu::adapters();
     if adapters.is_empty() {
-        say(format_args!("gpu: none found"))?;
+        show(format_args!("gpu: none found"))?;
     }
     let taken = best_card().ok();
     for adapter in &adapters {
         let taken = taken.as_ref().filter(|taken| taken.index == adapter.index);
         describe(adapter, taken.is_some())?;
         if let Some(taken) = taken {
-            say(format_args!("  {}", tried(taken)))?;
+            show(format_args!("  {}", tried(taken)))?;
         }
     }
     if taken.is_none() {
-        say(format_args!("  auto takes the CPU"))?;
+        show(format_args!("  auto takes the CPU"))?;
     }
     let presets: Vec<_> = Preset::with_gpu_kernels().map(Preset::name).collect();
-    say(format_args!(
+    show(format_args!(
         "  a GPU computes presets {}; all other presets run on the CPU",
         presets.join(", ")
     ))?;
     let hardware = |adapter: &&Adapter| adapter.kind != AdapterKind::Software;
     let found = Environment::here(adapters.iter().filter(hardware).count(), adapters.len());
     for advice in found.advice() {
-        say(format_args!("  {advice}"))?;
+        show(format_args!("  {advice}"))?;
     }
     if taken.is_none() && !adapters.is_empty() && !software_is_welcome() {
-        say(format_args!(
+        show(format_args!(
             "  software is taken by its number alone, or for tests with FNSF_ALLOW_SOFTWARE_GPU=1"
         ))?;
     }
@@ -53,24 +53,24 @@ fn describe(adapter: &Adapter, taken: bool) -> Result<(), Failure> {
         "" => String::new(),
         pci_id => format!(", {pci_id}"),
     };
-    say(format_args!(
+    show(format_args!(
         "gpu:{}: {} ({}{pci_id}){taken}",
         adapter.index,
         adapter.name,
         adapter.kind.name(),
     ))?;
-    say(format_args!(
+    show(format_args!(
         "  {}, driver {}",
         adapter.interface, adapter.driver
     ))?;
-    say(format_args!(
+    show(format_args!(
         "  largest buffer {:.1} GB, workgroup memory {} KiB",
         adapter.max_binding_bytes as f64 / 1e9,
         adapter.workgroup_bytes >> 10
     ))?;
     match adapter.matrix_tiles.as_slice() {
-        [] => say(format_args!("  no matrix units that this program can use")),
-        tiles => say(format_args!("  matrix units: {}", tiles.join(", "))),
+        [] => show(format_args!("  no matrix units that this program can use")),
+        tiles => show(format_args!("  matrix units: {}", tiles.join(", "))),
     }
 }
 

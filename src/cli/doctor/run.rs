@@ -7,7 +7,7 @@ use clap::Args;
 use super::gpus;
 use crate::cli::failure::Failure;
 use crate::cli::machine::available_bytes;
-use crate::cli::output::say;
+use crate::cli::output::show;
 use crate::flow::cpu::{Isa, NetworkWorkload};
 
 /// Points of the benchmark's cloud; a run takes tens of milliseconds at most.
@@ -21,30 +21,30 @@ pub(crate) struct Doctor {}
 impl Doctor {
     pub(crate) fn run(&self) -> Result<(), Failure> {
         let threads = std::thread::available_parallelism().map_or(1, usize::from);
-        say(format_args!("fnsf {}", env!("CARGO_PKG_VERSION")))?;
-        say(format_args!("cpu: {threads} threads"))?;
+        show(format_args!("fnsf {}", env!("CARGO_PKG_VERSION")))?;
+        show(format_args!("cpu: {threads} threads"))?;
         for (index, isa) in Isa::available().into_iter().enumerate() {
             let used = if index == 0 { ", used" } else { "" };
-            say(format_args!(
+            show(format_args!(
                 "  {}: network at {:.0} GFLOP/s a thread{used}",
                 isa.name(),
                 network_speed(isa) / 1e9
             ))?;
         }
         if !Isa::available().contains(&Isa::Avx2) {
-            say(format_args!(
+            show(format_args!(
                 "  no AVX2: the portable kernels are several times slower"
             ))?;
-            say(format_args!(
+            show(format_args!(
                 "  in a virtual machine, pass the host's CPU features through"
             ))?;
         }
         match available_bytes() {
-            Some(bytes) => say(format_args!(
+            Some(bytes) => show(format_args!(
                 "memory: {:.1} GB available",
                 bytes as f64 / 1e9
             ))?,
-            None => say(format_args!("memory: this system does not say"))?,
+            None => show(format_args!("memory: this system does not say"))?,
         }
         gpus::report()
     }

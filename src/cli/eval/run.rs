@@ -9,7 +9,7 @@ use super::print::{print, print_buckets, print_heading, print_row};
 use super::tracks;
 use crate::cli::failure::Failure;
 use crate::cli::files;
-use crate::cli::output::say;
+use crate::cli::output::show;
 use crate::formats::{FlowFile, Pair, PairTruth};
 use crate::scores::{Report, Scores};
 
@@ -138,5 +138,5 @@ impl Eval {
 
 fn print_json(report: &Report) -> Result<(), Failure> {
     let json = serde_json::to_string(report).map_err(Failure::internal)?;
-    say(format_args!("{json}"))
+    show(format_args!("{json}"))
 }

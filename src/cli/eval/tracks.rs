@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use crate::cli::failure::Failure;
 use crate::cli::files;
-use crate::cli::output::say;
+use crate::cli::output::show;
 use crate::flow::evaluate::{TrackingMetrics, TrackingPool, tracked_sweeps};
 use crate::text::grouped;
 
@@ -23,32 +23,32 @@ fn print_json(name: Option<&str>, metrics: &TrackingMetrics) -> Result<(), Failu
     if let Some(name) = name {
         json["tracks"] = name.into();
     }
-    say(format_args!("{json}"))
+    show(format_args!("{json}"))
 }
 
 /// Prints a score as text. It is of the file `name`, or of all together.
 fn print_text(name: Option<&str>, metrics: &TrackingMetrics) -> Result<(), Failure> {
     let percent = |whole: usize| 100.0 * metrics.matches as f64 / whole.max(1) as f64;
     let [truth, found] = [metrics.truth, metrics.found];
-    say(format_args!("{}", name.unwrap_or("all")))?;
-    say(format_args!(
+    show(format_args!("{}", name.unwrap_or("all")))?;
+    show(format_args!(
         "  objects x sweeps  {}, {:.1}% found",
         grouped(truth),
         percent(truth)
     ))?;
-    say(format_args!(
+    show(format_args!(
         "  found             {}, {:.1}% right",
         grouped(found),
         percent(found)
     ))?;
-    say(format_args!("  identity switches {}", metrics.switches))?;
-    say(format_args!(
+    show(format_args!("  identity switches {}", metrics.switches))?;
+    show(format_args!(
         "  distance          {:.2} m",
         metrics.distance_m
     ))?;
-    say(format_args!("  MOTA              {:.3}", metrics.mota))?;
-    say(format_args!("  IDF1              {:.3}", metrics.idf1))?;
-    say(format_args!("  HOTA              {:.3}", metrics.hota))
+    show(format_args!("  MOTA              {:.3}", metrics.mota))?;
+    show(format_args!("  IDF1              {:.3}", metrics.idf1))?;
+    show(format_args!("  HOTA              {:.3}", metrics.hota))
 }
 
 /// Compares each file of `found` tracks with its `truth`, and all together.

@@ -83,6 +83,16 @@ pub(super) fn numbered(path: &Path, pair: usize, pairs: usize) -> PathBuf {
 }
 
 impl Flow {
+    /// Whether files are written, and not only lines on stdout.
+    pub(super) fn writes(&self) -> bool {
+        let mut files = self
+            .output
+            .iter()
+            .chain(&self.picture)
+            .chain(self.tracks.outputs());
+        files.next().is_some()
+    }
+
     /// Refuses `--deskew on` where no sweep could be deskewed.
     pub(super) fn check_deskew(
         &self,

@@ -9,7 +9,7 @@ use super::arguments::{Flow, numbered};
 use super::print::print_report;
 use crate::cli::failure::Failure;
 use crate::cli::files;
-use crate::cli::output::say;
+use crate::cli::output::{show, without_reader};
 use crate::flow::{Estimate, Point};
 use crate::formats::{FlowFormat, FlowTable, write_flow};
 use crate::job::Report;
@@ -64,6 +64,21 @@ pub(super) fn put(flow: &Flow, pair: &Complete<'_>) -> Result<Option<f64>, Failu
         draw(estimate, source, path)?;
     }
     let latency_s = pair.arrived.map(|arrived| arrived.age_s());
+    let said = tell_of(flow, pair, latency_s, output.iter().chain(&picture));
+    match flow.writes() {
+        true => without_reader(said)?,
+        false => said?,
+    }
+    Ok(latency_s)
+}
+
+/// Prints a pair, with the files that were written.
+fn tell_of<'a>(
+    flow: &Flow,
+    pair: &Complete<'_>,
+    latency_s: Option<f64>,
+    written: impl Iterator<Item = &'a PathBuf>,
+) -> Result<(), Failure> {
     if flow.json {
         let json = match pair.arrived.zip(latency_s) {
             None => serde_json::to_string(&pair.report),
@@ -74,8 +89,7 @@ pub(super) fn put(flow: &Flow, pair: &Complete<'_>) -> Result<Option<f64>, Failu
                 waiting: arrived.waiting,
             }),
         };
-        say(format_args!("{}", json.map_err(Failure::internal)?))?;
-        return Ok(latency_s);
+        return show(format_args!("{}", json.map_err(Failure::internal)?));
     }
     print_report(&pair.report)?;
     if let Some((arrived, latency_s)) = pair.arrived.zip(latency_s) {
@@ -84,15 +98,15 @@ pub(super) fn put(flow: &Flow, pair: &Complete<'_>) -> Result<Option<f64>, Failu
             0 => String::new(),
             count => format!(", {count} sweeps wait"),
         };
-        say(format_args!(
+        show(format_args!(
             "  {source} to {target}: {:.0} ms after its last byte{waiting}",
             latency_s * 1e3
         ))?;
     }
-    for path in output.iter().chain(&picture) {
-        say(format_args!("  wrote {}", path.display()))?;
+    for path in written {
+        show(format_args!("  wrote {}", path.display()))?;
     }
-    Ok(latency_s)
+    Ok(())
 }
 
 /// The report of a pair in a folder that is followed.

@@ -34,9 +34,9 @@ struct Topic {
     timed: usize,
     /// Why the times of the points of a sweep are not used.
     refused_times: Option<String>,
-    /// Time of the last sweep, nanoseconds.
-    last: Option<u64>,
-    /// Messages with the time of the one before, which were left out.
+    /// Times of the sweeps, nanoseconds: the names of their files.
+    stamps: HashSet<u64>,
+    /// Messages with the time of an earlier one, which were left out.
     repeated: usize,
 }
 
@@ -117,14 +117,14 @@ impl Unpack {
             0 => message.logged_ns,
             stamp => stamp,
         };
-        if topic.last == Some(stamp) {
+        if topic.stamps.contains(&stamp) {
             topic.repeated += 1;
             return Ok(());
         }
         let name = topic.folder.join(format!("{stamp:019}.pcd"));
         write_sweep(self.output(), &name, &sweep.points, sweep.times.as_ref())
             .map_err(Stop::Failed)?;
-        topic.last = Some(stamp);
+        topic.stamps.insert(stamp);
         topic.sweeps += 1;
         topic.points += sweep.points.len();
         topic.dropped += sweep.dropped;
@@ -178,7 +178,7 @@ impl Unpack {
             if topic.repeated > 0 {
                 let repeated = grouped(topic.repeated);
                 say(format_args!(
-                    "  {repeated} clouds with the time of the one before are left out"
+                    "  {repeated} clouds with the time of an earlier one are left out"
                 ))?;
             }
             match &topic.refused_times {

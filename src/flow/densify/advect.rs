@@ -24,7 +24,7 @@ const PIECE: usize = 1 << 17;
 pub(super) struct PropagatedCloud {
     points: Vec<Point>,
     sweep: Vec<u32>,
-    /// Marks ground points, which have no residual motion.
+    /// Marks ground points. They have no residual motion beside an ego motion.
     ground: Vec<bool>,
     dynamic: Vec<bool>,
     converged: Vec<bool>,
@@ -48,6 +48,9 @@ impl PropagatedCloud {
 
     /// Euler integration from the time of the field's source sweep to that of its target, in
     /// `substeps` equal steps. Afterwards the cloud is in the target's frame.
+    ///
+    /// A field that is known at the source's points alone takes one step: after a part of the way
+    /// a point would have left them, and stop.
     pub(super) fn step(
         &mut self,
         by: Context<'_>,
@@ -55,6 +58,10 @@ impl PropagatedCloud {
         substeps: usize,
     ) -> Result<(), DensifyError> {
         self.points = field.static_positions(&self.points);
+        let substeps = match field.residual.is_at_points() {
+            true => 1,
+            false => substeps,
+        };
         for _ in 0..substeps {
             self.advect(by, field, 1.0 / substeps as f32)?;
         }
@@ -73,15 +80,14 @@ impl PropagatedCloud {
         self.advect(by, field, share as f32)
     }
 
-    /// Adds `share` of the residual motion at the current positions to all points that are not
-    /// ground.
+    /// Adds `share` of the residual motion at the current positions to all points that may move.
     fn advect(
         &mut self,
         by: Context<'_>,
         field: &MotionField,
         share: f32,
     ) -> Result<(), DensifyError> {
-        let rows = self.movable();
+        let rows = self.movable(field);
         let indices: Vec<Point> = rows.iter().map(|&row| self.points[row]).collect();
         let residual = by.motion(field, &indices)?;
         for (row, residual) in rows.into_iter().zip(residual) {
@@ -99,15 +105,33 @@ impl PropagatedCloud {
         Ok(())
     }
 
-    /// The inverse step, from the time of the field's target sweep to that of its source. For each
-    /// position y it solves `z = y - g(z)` by fixed-point iteration, where z is the static
-    /// position.
+    /// The inverse step, from the time of the field's target sweep to that of its source.
     pub(super) fn invert(
         &mut self,
         by: Context<'_>,
         field: &MotionField,
     ) -> Result<(), DensifyError> {
-        let mut rows = self.movable();
+        match field.residual.reversed() {
+            Some(residual) => {
+                let ego = field.ego;
+                self.advect(by, &MotionField { ego, residual }, 1.0)?;
+            }
+            None => self.find_fixed_points(by, field)?,
+        }
+        if let Some(motion) = &field.ego {
+            self.transform(&motion.inverse());
+        }
+        Ok(())
+    }
+
+    /// For each position y solves `z = y - g(z)` by fixed-point iteration, where z is the static
+    /// position.
+    fn find_fixed_points(
+        &mut self,
+        by: Context<'_>,
+        field: &MotionField,
+    ) -> Result<(), DensifyError> {
+        let mut rows = self.movable(field);
         let ends = self.points.clone();
         for _ in 0..CORRECTIONS {
             let indices: Vec<Point> = rows.iter().map(|&row| self.points[row]).collect();
@@ -133,9 +157,6 @@ impl PropagatedCloud {
             for (row, end) in ends.iter().enumerate() {
                 self.dynamic[row] |= self.points[row] != *end;
             }
-        }
-        if let Some(motion) = &field.ego {
-            self.transform(&motion.inverse());
         }
         Ok(())
     }
@@ -164,10 +185,12 @@ impl PropagatedCloud {
         }
     }
 
-    /// Rows of the points that are not ground.
-    fn movable(&self) -> Vec<usize> {
+    /// Rows of the points that a field may move: all but the ground. A function of space has the motion
+    /// of the ground, too, where there is no ego motion.
+    fn movable(&self, field: &MotionField) -> Vec<usize> {
+        let has_ground = field.ego.is_none() && !field.residual.is_at_points();
         (0..self.points.len())
-            .filter(|&row| !self.ground[row])
+            .filter(|&row| !self.ground[row] || has_ground)
             .collect()
     }
 }

@@ -8,7 +8,7 @@ use crate::flow::data::RigidTransform;
 use crate::flow::data::{Point, Uncontrolled, transform_point};
 use crate::flow::field::{Conditioning, Network, last_layer, mlp};
 use crate::flow::motion::MotionField;
-use crate::flow::motion::Residual;
+use crate::flow::motion::{Residual, SampledMotion};
 use crate::flow::sequence::Sweep;
 
 /// Rounding of single-precision coordinates of a few metres, metres.
@@ -172,10 +172,52 @@ fn what_a_field_says_below_the_threshold_of_motion_moves_nothing() {
     let sweeps = sweeps(3);
     let cloud = dense(&plan, &sweeps, &noise, &noise).expect("a cloud");
     assert_eq!(cloud.points[0], sweeps[0].points[0]);
-    // Without an ego motion the field moves static points, too.
+    // Without an ego motion the field moves static points, too, and the ground with them.
     let all = constant(None, [0.02, 0.02, 0.0]);
     let cloud = dense(&plan, &sweeps, &all, &all).expect("a cloud");
     assert_near(cloud.points[0], [0.04, 0.04, 0.0], "two steps");
+    assert_near(cloud.points[1], [0.04, 1.04, 2.0], "the ground");
+}
+
+#[test]
+fn an_object_does_not_take_the_ground_below_it_along() {
+    let mut sweeps = sweeps(2);
+    sweeps[0].points[2] = [0.0, 0.0, -0.3];
+    let by = vec![[1.5, 0.0, 0.0]];
+    let field = MotionField {
+        ego: None,
+        residual: Residual::Sampled(SampledMotion::new(vec![[0.0; 3]], by).into()),
+    };
+    let plan = Plan::new(2, 1.0, LaterSweeps::Reverse, 1).expect("a plan");
+    let cloud = dense(&plan, &sweeps, &field, &field).expect("a cloud");
+    assert_near(cloud.points[0], [1.5, 0.0, 0.0], "the object");
+    assert_near(cloud.points[1], [0.0, 0.0, -0.3], "the ground");
+}
+
+#[test]
+fn an_object_that_leaves_its_own_points_behind_goes_its_whole_way() {
+    // 1.5 m a sweep, with nothing within reach of half the way.
+    let standing = Some(RigidTransform::identity());
+    let at = |x: f32, by: f32| MotionField {
+        ego: standing,
+        residual: Residual::Sampled(
+            SampledMotion::new(vec![[x, 0.0, 0.0]], vec![[by, 0.0, 0.0]]).into(),
+        ),
+    };
+    let (ahead, back) = (at(0.0, 1.5), at(1.5, -1.5));
+    let mut sweeps = sweeps(2);
+    sweeps[1].points[0] = [1.5, 0.0, 0.0];
+    for later in [LaterSweeps::Reverse, LaterSweeps::Inverse] {
+        for (reference_time, x) in [(1.0, 1.5), (0.0, 0.0)] {
+            let plan = Plan::new(2, reference_time, later, 4).expect("a plan");
+            let cloud = dense(&plan, &sweeps, &ahead, &back).expect("a cloud");
+            for row in [0, 2] {
+                assert_near(cloud.points[row], [x, 0.0, 0.0], "both sweeps at one place");
+                assert!(cloud.converged[row]);
+            }
+            assert_ne!(cloud.dynamic[0], cloud.dynamic[2], "one of them has moved");
+        }
+    }
 }
 
 #[test]

@@ -3,6 +3,8 @@
 
 use std::sync::Arc;
 
+use rayon::prelude::*;
+
 use super::ego_motion::{ego_motion, has_time_for_all};
 use super::method::{Input, Solved};
 use super::result::{FieldSolution, Solution};
@@ -18,13 +20,6 @@ use crate::flow::spatial::{NOISE, dbscan};
 
 /// A cluster with fewer points than this, or fewer candidates in the target, is static.
 const LEAST_POINTS: usize = 4;
-
-/// A cluster of the source and the target points that it is fitted to.
-struct Part {
-    /// Rows of the source.
-    rows: Vec<u32>,
-    target: Vec<Point>,
-}
 
 /// Estimates the residual motion by a fit for each cluster, the largest first. Clusters that the
 /// deadline leaves no time for are static.
@@ -47,14 +42,15 @@ pub(super) fn residual_motion(
     let alignment = input.align(host, ego)?;
     let ego = alignment.ego;
     let aligned = &alignment.aligned;
-    let clusters = || parts(aligned, &selection.target, partition);
-    let parts = host.threads().install(clusters);
+    let (clusters, candidates) = host.threads().install(|| {
+        let clusters = clusters_of(aligned, partition);
+        (clusters, Candidates::new(&selection.target))
+    });
     let precomputed_at = control.seconds();
     let mut fits = Fits {
         backend,
         options,
         seed: input.options.seed,
-        aligned,
         ego: ego.as_ref(),
         residual: vec![[0.0; 3]; aligned.len()],
         solution: FieldSolution {
@@ -69,8 +65,8 @@ pub(super) fn residual_motion(
         fitted: 0,
         stop_reason: StopReason::Converged,
     };
-    let mut left: usize = parts.iter().map(|part| part.rows.len()).sum();
-    for (number, part) in parts.iter().enumerate() {
+    let mut left: usize = clusters.iter().map(Vec::len).sum();
+    for (number, rows) in clusters.iter().enumerate() {
         match control.interrupt() {
             Some(Interrupt::Cancelled) => return Err(FlowError::Cancelled),
             Some(Interrupt::Deadline) => {
@@ -79,22 +75,26 @@ pub(super) fn residual_motion(
             }
             None => {}
         }
-        // Each cluster has the share of the time left that it has of the points left.
-        let others = (left - part.rows.len()) as f64 / left as f64;
-        left -= part.rows.len();
-        fits.fit(
-            part,
-            &PartControl {
-                early: EarlierDeadline {
-                    control,
-                    reserve: control
-                        .seconds_left()
-                        .map_or(0.0, |left| left.max(0.0) * others),
-                },
-                number,
-                count: parts.len(),
+        // Each cluster has the share of the time left that it has of the points left. What it does not
+        // need is for those after it.
+        let others = (left - rows.len()) as f64 / left as f64;
+        left -= rows.len();
+        let source: Vec<Point> = rows.iter().map(|&row| aligned[row as usize]).collect();
+        let target = candidates.around(&source, partition.expansion_m);
+        if target.len() < LEAST_POINTS {
+            continue;
+        }
+        let control = PartControl {
+            early: EarlierDeadline {
+                control,
+                reserve: control
+                    .seconds_left()
+                    .map_or(0.0, |left| left.max(0.0) * others),
             },
-        )?;
+            number,
+            count: clusters.len(),
+        };
+        fits.fit(rows, [&source, &target], &control)?;
     }
     let Fits {
         residual,
@@ -125,7 +125,6 @@ struct Fits<'a> {
     backend: &'a dyn Backend,
     options: &'a FieldOptions,
     seed: u64,
-    aligned: &'a [Point],
     ego: Option<&'a RigidTransform>,
     residual: Vec<Point>,
     /// Sums over the clusters; of the loss, weighted by the number of points.
@@ -136,18 +135,19 @@ struct Fits<'a> {
 }
 
 impl Fits<'_> {
-    /// Fits a field to one cluster and takes over its flow.
+    /// Fits a field to one cluster, given by its rows of the source, its points and the target
+    /// points around them, and takes over its flow.
     ///
     /// # Errors
     /// As [`residual_motion`].
-    fn fit(&mut self, part: &Part, control: &dyn Control) -> Result<(), FlowError> {
+    fn fit(
+        &mut self,
+        rows: &[u32],
+        clouds: [&[Point]; 2],
+        control: &dyn Control,
+    ) -> Result<(), FlowError> {
         let options = self.options;
-        let source: Vec<Point> = part
-            .rows
-            .iter()
-            .map(|&row| self.aligned[row as usize])
-            .collect();
-        let [source, target] = [&source, &part.target].map(|cloud| options.seen(cloud));
+        let [source, target] = clouds.map(|cloud| options.seen(cloud));
         let clouds = [source.as_ref(), target.as_ref()];
         let prepared = field::prepare_target(self.backend, clouds, options, control)?;
         let fitted = match &prepared {
@@ -166,7 +166,7 @@ impl Fits<'_> {
             }
             .run(None)?,
         };
-        for (&row, flow) in part.rows.iter().zip(&fitted.residual) {
+        for (&row, flow) in rows.iter().zip(&fitted.residual) {
             self.residual[row as usize] = *flow;
         }
         let (report, solution) = (&fitted.report, &mut self.solution);
@@ -219,8 +219,8 @@ impl Control for PartControl<'_> {
     }
 }
 
-/// The clusters of `source` with the target points around each, the largest first.
-fn parts(source: &[Point], target: &[Point], options: &PartitionOptions) -> Vec<Part> {
+/// The rows of the clusters of `source`, the largest first.
+fn clusters_of(source: &[Point], options: &PartitionOptions) -> Vec<Vec<u32>> {
     let labels = dbscan::clusters(source, options.radius_m, options.min_points);
     let clusters = labels.iter().filter(|&&label| label != NOISE).max();
     let mut rows = vec![Vec::new(); clusters.map_or(0, |&last| last as usize + 1)];
@@ -229,51 +229,78 @@ fn parts(source: &[Point], target: &[Point], options: &PartitionOptions) -> Vec<
             rows[label as usize].push(row);
         }
     }
-    let mut parts: Vec<Part> = rows
-        .into_iter()
-        .filter_map(|rows| {
-            let points = rows.iter().map(|&row| source[row as usize]);
-            let target = around(&points.collect::<Vec<_>>(), target, options.expansion_m);
-            (target.len() >= LEAST_POINTS).then_some(Part { rows, target })
-        })
-        .collect();
-    parts.sort_by_key(|part| std::cmp::Reverse(part.rows.len()));
-    parts
+    rows.sort_by_key(|rows| std::cmp::Reverse(rows.len()));
+    rows
 }
 
-/// The target points that `cluster` is fitted to: those within its box in x and y, grown by
-/// `expansion_m`, and of them those nearest to its center, one fewer than the cluster has points.
-fn around(cluster: &[Point], target: &[Point], expansion_m: f32) -> Vec<Point> {
-    let axis = |axis: usize| {
-        let values = cluster.iter().map(|point| point[axis]);
-        values.fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), value| {
-            (low.min(value), high.max(value))
-        })
-    };
-    let [(west, east), (south, north)] = [axis(0), axis(1)];
-    let [wide, deep] = [east - west, north - south];
-    let longest = wide.max(deep).max(f32::MIN_POSITIVE);
-    let [more_x, more_y] = [wide, deep].map(|edge| expansion_m * edge / longest);
-    let inside = |&&[x, y, _]: &&Point| {
-        x > west - more_x && x < east + more_x && y > south - more_y && y < north + more_y
-    };
-    let mut found: Vec<Point> = target.iter().filter(inside).copied().collect();
-    let sum = |axis: usize| {
-        cluster
-            .iter()
-            .map(|point| f64::from(point[axis]))
-            .sum::<f64>()
-    };
-    let center = [0, 1, 2].map(|axis| (sum(axis) / cluster.len().max(1) as f64) as f32);
-    let most = cluster.len().min(found.len()).saturating_sub(1);
-    if most < found.len() && most > 0 {
-        let by_distance = |a: &Point, b: &Point| {
-            square_distance(*a, center).total_cmp(&square_distance(*b, center))
-        };
-        found.select_nth_unstable_by(most - 1, by_distance);
+/// The target, from which each cluster gets the points that it is fitted to.
+struct Candidates<'a> {
+    target: &'a [Point],
+    /// Rows of the target, by x.
+    by_x: Vec<u32>,
+}
+
+impl<'a> Candidates<'a> {
+    fn new(target: &'a [Point]) -> Self {
+        let mut by_x: Vec<u32> = (0..target.len() as u32).collect();
+        by_x.par_sort_unstable_by(|&a, &b| {
+            let [a, b] = [a, b].map(|row| target[row as usize][0]);
+            a.total_cmp(&b)
+        });
+        Self { target, by_x }
     }
-    found.truncate(most);
-    found
+
+    /// The points within a box in x and y, in the order of the target.
+    fn within(&self, [west, east]: [f32; 2], [south, north]: [f32; 2]) -> Vec<Point> {
+        let x = |row: &u32| self.target[*row as usize][0];
+        let first = self.by_x.partition_point(|row| x(row) <= west);
+        let slab = self.by_x[first..].iter().take_while(|row| x(row) < east);
+        let is_inside = |row: &u32| {
+            let y = self.target[*row as usize][1];
+            y > south && y < north
+        };
+        let mut rows: Vec<u32> = slab.copied().filter(is_inside).collect();
+        rows.sort_unstable();
+        rows.into_iter()
+            .map(|row| self.target[row as usize])
+            .collect()
+    }
+
+    /// The points that `cluster` is fitted to: those within its box in x and y, grown by
+    /// `expansion_m`, and of them those nearest to its center, one fewer than the cluster has
+    /// points.
+    fn around(&self, cluster: &[Point], expansion_m: f32) -> Vec<Point> {
+        let axis = |axis: usize| {
+            let values = cluster.iter().map(|point| point[axis]);
+            values.fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), value| {
+                (low.min(value), high.max(value))
+            })
+        };
+        let [(west, east), (south, north)] = [axis(0), axis(1)];
+        let [wide, deep] = [east - west, north - south];
+        let longest = wide.max(deep).max(f32::MIN_POSITIVE);
+        let [more_x, more_y] = [wide, deep].map(|edge| expansion_m * edge / longest);
+        let mut found = self.within(
+            [west - more_x, east + more_x],
+            [south - more_y, north + more_y],
+        );
+        let sum = |axis: usize| {
+            cluster
+                .iter()
+                .map(|point| f64::from(point[axis]))
+                .sum::<f64>()
+        };
+        let center = [0, 1, 2].map(|axis| (sum(axis) / cluster.len().max(1) as f64) as f32);
+        let most = cluster.len().min(found.len()).saturating_sub(1);
+        if most < found.len() && most > 0 {
+            let by_distance = |a: &Point, b: &Point| {
+                square_distance(*a, center).total_cmp(&square_distance(*b, center))
+            };
+            found.select_nth_unstable_by(most - 1, by_distance);
+        }
+        found.truncate(most);
+        found
+    }
 }
 
 #[cfg(test)]
@@ -288,6 +315,22 @@ mod tests {
         (0..count)
             .map(|_| [x + axis(2.0), axis(0.5), axis(0.75)])
             .collect()
+    }
+
+    /// The clusters of `source`, each with the target points that it is fitted to.
+    fn parts(
+        source: &[Point],
+        target: &[Point],
+        options: &PartitionOptions,
+    ) -> Vec<(Vec<u32>, Vec<Point>)> {
+        let candidates = Candidates::new(target);
+        let clusters = clusters_of(source, options).into_iter();
+        let of = |rows: Vec<u32>| {
+            let points: Vec<Point> = rows.iter().map(|&row| source[row as usize]).collect();
+            let around = candidates.around(&points, options.expansion_m);
+            (rows, around)
+        };
+        clusters.map(of).collect()
     }
 
     #[test]
@@ -309,19 +352,19 @@ mod tests {
         let parts = parts(&source, &target, &options);
         let sizes: Vec<_> = parts
             .iter()
-            .map(|part| (part.rows.len(), part.target.len()))
+            .map(|(rows, target)| (rows.len(), target.len()))
             .collect();
         // 102 candidates for 400 points, and 500 for 250: one fewer than the smaller number.
         assert_eq!(sizes, [(400, 101), (250, 249)]);
-        assert!(parts[0].target.contains(&inside[1]) && !parts[0].target.contains(&outside[0]));
+        assert!(parts[0].1.contains(&inside[1]) && !parts[0].1.contains(&outside[0]));
         let mean = |axis: usize| {
-            let rows = parts[1].rows.iter();
+            let rows = parts[1].0.iter();
             let values = rows.map(|&row| source[row as usize][axis]);
-            values.sum::<f32>() / parts[1].rows.len() as f32
+            values.sum::<f32>() / parts[1].0.len() as f32
         };
         let center = [mean(0), mean(1), mean(2)];
         let nearest = |point: &Point| square_distance(*point, center);
-        let farthest = parts[1].target.iter().map(nearest).fold(0.0, f32::max);
+        let farthest = parts[1].1.iter().map(nearest).fold(0.0, f32::max);
         let nearer = target
             .iter()
             .filter(|point| nearest(point) < farthest * 0.98);
@@ -335,6 +378,6 @@ mod tests {
             &car(50, 30.0, 2),
             &PartitionOptions::published(),
         );
-        assert!(parts.is_empty());
+        assert!(parts.iter().all(|(_, target)| target.is_empty()));
     }
 }

@@ -5,7 +5,7 @@ use super::method::{Input, Solved};
 use super::neighbors::aligned_neighbors;
 use super::result::{ObjectSolution, Solution};
 use crate::flow::data::StopReason;
-use crate::flow::data::{Interrupt, Point, RigidTransform};
+use crate::flow::data::{Interrupt, RigidTransform};
 use crate::flow::error::FlowError;
 use crate::flow::field::{Backend, BackendError};
 use crate::flow::motion::Residual;
@@ -37,10 +37,9 @@ pub(super) fn residual_motion(
     let ego = alignment.ego;
     let motion = ego.unwrap_or_default();
     let aligned = &alignment.aligned;
-    let find_ground = |sweeps: &[&[Point]]| host.ground(sweeps);
     let neighbors = match &ego {
         None => Vec::new(),
-        Some(ego) => aligned_neighbors(host, problem, input.options, ego, &find_ground, control)?,
+        Some(ego) => aligned_neighbors(host, input, ego)?,
     };
     let precomputed_at = control.seconds();
     let share = |times: &[f32]| -> Vec<f32> {

@@ -5,6 +5,7 @@
 //! The calibration of the confidence and the tracks of a sequence are measured as well.
 
 mod argoverse;
+mod assignment;
 mod buckets;
 mod classes;
 mod metrics;

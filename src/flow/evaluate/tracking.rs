@@ -1,11 +1,9 @@
 //! Metrics of tracks: CLEAR MOT (Bernardin and Stiefelhagen 2008), IDF1 (Ristani et al. 2016) and
 //! HOTA (Luiten et al. 2021), by the distance of centers in the plane.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
-use pathfinding::kuhn_munkres::kuhn_munkres;
-use pathfinding::matrix::Matrix;
-
+use super::assignment::{Edge, assign, assignment};
 use crate::flow::tracks::{Track, TrackState};
 
 /// Least speed of a true object that is to be found, m/s.
@@ -18,8 +16,6 @@ pub const MATCHED_WITHIN_M: f64 = 2.0;
 const LEVELS: usize = 19;
 /// Additional weight of a match that is kept: above the sum of the similarities of a sweep.
 const KEPT: f64 = 1e4;
-/// Integer scale of the weights of an assignment.
-const SCALE: f64 = 1e6;
 
 /// An object in one sweep.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -228,22 +224,23 @@ impl TrackingPool {
 
 /// Number of matches in the sweeps of one sequence that the best assignment of whole identities explains.
 fn explained(sweeps: &[TrackedSweep]) -> f64 {
-    let mut together: BTreeMap<(u32, u32), usize> = BTreeMap::new();
+    let mut together: BTreeMap<[u32; 2], f64> = BTreeMap::new();
     for sweep in sweeps {
         for truth in &sweep.truth {
             for found in sweep.found.iter().filter(|f| similarity(truth, f) > 0.0) {
-                *together.entry((truth.id, found.id)).or_default() += 1;
+                *together.entry([truth.id, found.id]).or_default() += 1.0;
             }
         }
     }
-    let ids = |of: fn(&TrackedSweep) -> &Vec<TrackedObject>| -> Vec<u32> {
-        let all: BTreeSet<u32> = sweeps.iter().flat_map(of).map(|object| object.id).collect();
-        all.into_iter().collect()
-    };
-    let (truths, found) = (ids(|s| &s.truth), ids(|s| &s.found));
-    let common = |t: &u32, f: &u32| together.get(&(*t, *f)).map_or(0.0, |&n| n as f64);
-    let assigned = assign(&truths, &found, common).into_iter();
-    assigned.map(|(t, f)| common(&truths[t], &found[f])).sum()
+    let edges: Vec<Edge> = together
+        .iter()
+        .map(|(ids, &weight)| Edge {
+            ends: ids.map(|id| id as usize),
+            weight,
+        })
+        .collect();
+    let assigned = assignment(&edges).into_iter();
+    assigned.map(|edge| edge.weight).sum()
 }
 
 /// The sweep without its ignored objects, and without the found objects that are assigned to them.
@@ -268,46 +265,6 @@ fn distance_m(a: &TrackedObject, b: &TrackedObject) -> f64 {
 /// 1 for one position, 0 from [`MATCHED_WITHIN_M`] on.
 fn similarity(a: &TrackedObject, b: &TrackedObject) -> f64 {
     (1.0 - distance_m(a, b) / MATCHED_WITHIN_M).max(0.0)
-}
-
-/// The assignment of the largest sum of weights: pairs of indices with a positive weight.
-fn assign<T>(rows: &[T], columns: &[T], weight: impl Fn(&T, &T) -> f64) -> Vec<(usize, usize)> {
-    let swapped = rows.len() > columns.len();
-    let (few, many) = if swapped {
-        (columns, rows)
-    } else {
-        (rows, columns)
-    };
-    if few.is_empty() {
-        return Vec::new();
-    }
-    let weight = |row: &T, column: &T| {
-        let weight = if swapped {
-            weight(column, row)
-        } else {
-            weight(row, column)
-        };
-        (weight * SCALE).round() as i64
-    };
-    let weights = few
-        .iter()
-        .map(|row| many.iter().map(|column| weight(row, column)).collect());
-    let weights: Vec<Vec<i64>> = weights.collect();
-    let Ok(matrix) = Matrix::from_rows(weights.clone()) else {
-        return Vec::new();
-    };
-    let (_, assigned) = kuhn_munkres(&matrix);
-    let pairs = assigned.into_iter().enumerate();
-    pairs
-        .filter(|&(row, column)| weights[row][column] > 0)
-        .map(|(row, column)| {
-            if swapped {
-                (column, row)
-            } else {
-                (row, column)
-            }
-        })
-        .collect()
 }
 
 #[cfg(test)]

@@ -24,6 +24,8 @@ const SOFTWARE_SILENCE: Duration = Duration::from_secs(120);
 /// purpose: a wait that times out while another thread finds the queue empty trips an assertion of
 /// wgpu 30 (gfx-rs/wgpu#9958), which loses the device.
 const POLL_INTERVAL: Duration = Duration::from_secs(2);
+/// The same on a software device, which takes seconds for a submission on a busy machine.
+const SOFTWARE_POLL_INTERVAL: Duration = Duration::from_secs(10);
 /// Distances that are computed in one submission to the driver: 7 s at 1e10 a second.
 const MOST_DISTANCES: usize = 1 << 36;
 /// The same on a software device: 17 s at 1e9 a second.
@@ -46,6 +48,7 @@ pub(super) struct Context {
     pub(super) tile: Result<Tile, String>,
     networks: Mutex<Vec<u32>>,
     longest_silence: Duration,
+    poll_interval: Duration,
     /// Distances that are computed in one submission to the driver.
     pub(super) most_distances: usize,
 }
@@ -99,6 +102,10 @@ impl Context {
             longest_silence: match adapter.kind {
                 AdapterKind::Software => SOFTWARE_SILENCE,
                 _ => LONGEST_SILENCE,
+            },
+            poll_interval: match adapter.kind {
+                AdapterKind::Software => SOFTWARE_POLL_INTERVAL,
+                _ => POLL_INTERVAL,
             },
             tile,
             device,
@@ -292,11 +299,11 @@ impl Context {
             self.watchdog.check()?;
             let wait = wgpu::PollType::Wait {
                 submission_index: Some(submission.clone()),
-                timeout: Some(POLL_INTERVAL),
+                timeout: Some(self.poll_interval),
             };
             match self.device.poll(wait) {
                 Ok(_) => break,
-                Err(wgpu::PollError::Timeout) => waited += POLL_INTERVAL,
+                Err(wgpu::PollError::Timeout) => waited += self.poll_interval,
                 Err(error) => return Err(BackendError::Device(error.to_string())),
             }
             if waited > self.longest_silence {

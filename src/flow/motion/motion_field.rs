@@ -34,6 +34,25 @@ pub enum Residual {
     Sampled(Arc<SampledMotion>),
 }
 
+impl Residual {
+    /// Whether the motion is known at the source's points alone, and not as a function of space: a
+    /// position half a metre away from them does not move.
+    pub(crate) fn is_at_points(&self) -> bool {
+        matches!(self, Self::Objects(_) | Self::Sampled(_))
+    }
+
+    /// The motion back to the source's time, as a function of the position at the target's time.
+    /// `None` for a function of space, which has to be inverted position by position.
+    pub(crate) fn reversed(&self) -> Option<Self> {
+        match self {
+            Self::Still => Some(Self::Still),
+            Self::Network(_) | Self::Linear(_) => None,
+            Self::Objects(motions) => Some(Self::Objects(Arc::new(motions.reversed()))),
+            Self::Sampled(motion) => Some(Self::Sampled(Arc::new(motion.reversed()))),
+        }
+    }
+}
+
 impl MotionField {
     /// Transforms `points` (N x 3, metres) of the source's frame into the target's frame by the ego
     /// motion: N x 3 static positions, metres. Without an ego motion the points are returned

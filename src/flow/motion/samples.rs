@@ -32,6 +32,14 @@ impl SampledMotion {
         }
     }
 
+    /// The motion back from where the points arrive.
+    pub(super) fn reversed(&self) -> Self {
+        let rows = self.points.iter().zip(&self.displacements);
+        let arrived = rows.map(|(point, by)| core::array::from_fn(|a| point[a] + by[a]));
+        let back = self.displacements.iter().map(|by| by.map(|c| -c));
+        Self::new(arrived.collect(), back.collect())
+    }
+
     /// The displacements of N `positions` (N x 3, metres): N x 3, metres.
     pub fn displacements_at(&self, positions: &[Point]) -> Vec<Point> {
         let at = |&position: &Point| {

@@ -41,10 +41,17 @@ impl ObjectMotions {
             chosen.filter(move |&(_, &owner)| (owner != NOISE) == moves)
         };
         let moving: Vec<Point> = of(true).map(|(&point, _)| point).collect();
-        let moving = ColumnIndex::new(&moving, 2.0 * REACH_M);
-        // A static point farther from all moving points is never the nearest to a position that may
-        // move.
-        let matters = |point: Point| moving.nearest(point, 2.0 * REACH_M).is_some();
+        let arrived: Vec<Point> = of(true)
+            .map(|(&point, &owner)| motions[owner as usize].apply(point))
+            .collect();
+        let [moving, arrived] =
+            [&moving, &arrived].map(|points| ColumnIndex::new(points, 2.0 * REACH_M));
+        // A static point farther from all moving points, before and after their motion, is never the
+        // nearest to a position that may move.
+        let matters = |point: Point| {
+            let is_near = |points: &ColumnIndex| points.nearest(point, 2.0 * REACH_M).is_some();
+            is_near(&moving) || is_near(&arrived)
+        };
         let standing = of(false).map(|(&point, _)| point);
         let standing: Vec<Point> = standing.filter(|&point| matters(point)).collect();
         Self {
@@ -53,6 +60,19 @@ impl ObjectMotions {
             moving,
             standing: ColumnIndex::new(&standing, REACH_M),
         }
+    }
+
+    /// The motions back from where the moving points arrive.
+    pub(crate) fn reversed(&self) -> Self {
+        let (motions, moving, standing) = self.parts();
+        let arrived = moving
+            .iter()
+            .map(|&(point, owner)| motions[owner as usize].apply(point));
+        let points: Vec<Point> = arrived.chain(standing.iter().copied()).collect();
+        let owners = moving.iter().map(|&(_, owner)| owner);
+        let owners: Vec<u32> = owners.chain(standing.iter().map(|_| NOISE)).collect();
+        let back = motions.iter().map(|motion| motion.repeated(-1));
+        Self::new(back.collect(), &points, &owners)
     }
 
     /// The motions, the moving points with the index of each one's motion, and the static points
@@ -130,6 +150,18 @@ impl ObjectMotions {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_point_goes_back_with_the_point_that_arrives_nearest_to_it() {
+        // 3 m forward, to a place beside a pole.
+        let motion = PlanarMotion::still([0.0; 2]).shifted([3.0, 0.0]);
+        let points = [[0.0; 3], [3.4, 0.0, 0.0]];
+        let back = ObjectMotions::new(vec![motion], &points, &[0, NOISE]).reversed();
+        let positions = [[3.0, 0.0, 0.0], [3.1, 0.1, 0.0], [3.3, 0.0, 0.0], [0.0; 3]];
+        let moved = back.residual_at(&positions).into_iter();
+        let moved: Vec<bool> = moved.map(|residual| residual == [-3.0, 0.0, 0.0]).collect();
+        assert_eq!(moved, [true, true, false, false]);
+    }
 
     #[test]
     fn a_place_moves_with_the_nearest_point_and_far_from_movers_not_at_all() {

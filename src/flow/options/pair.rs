@@ -69,6 +69,15 @@ impl Options {
         }
     }
 
+    /// Whether the motion of a pair is known at its source's points alone, as that of objects and of
+    /// clusters is. Densification then asks it once a step.
+    pub fn is_known_at_points(&self) -> bool {
+        match &self.method {
+            Method::Objects(_) => true,
+            Method::Field(field) => field.partition.is_some(),
+        }
+    }
+
     /// The options of the field fit; none for objects.
     pub fn field(&self) -> Option<&FieldOptions> {
         match &self.method {

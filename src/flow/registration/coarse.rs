@@ -1,8 +1,8 @@
 //! Coarse registration: the best fit from several initial guesses.
 //!
 //! A single coarse fit mostly recovers a rotation of 4 degrees together with a translation of 3 m.
-//! Vehicles drive forward and turn, so the initial guesses are translations along x and rotations
-//! about z. The correct motion scores 0.06 to 0.28. Rotated guesses are skipped where all guesses
+//! Vehicles drive forward and turn, so the initial guesses are translations along x, or in the end
+//! along y, and rotations about z. The correct motion scores 0.06 to 0.28. Rotated guesses are skipped where all guesses
 //! without rotation converge to one motion. Guesses far from the prior are tried where no near one
 //! aligns the clouds.
 
@@ -26,8 +26,8 @@ const TRIAL: Schedule = Schedule {
     within_m: [3.0, 2.0],
     scale_m: [1.0, 0.3],
 };
-/// Translations of the initial guesses from the prior, along x, metres. The first [`NEAR`] suffice
-/// for sweeps at 10 Hz, the others for 2 Hz.
+/// Translations of the initial guesses from the prior, along one axis, metres. The first [`NEAR`]
+/// suffice for sweeps at 10 Hz, the others for 2 Hz.
 const DRIVES_M: [f64; 9] = [0.0, 3.0, -3.0, 6.0, -6.0, 9.0, -9.0, 12.0, -12.0];
 /// Rotations of the initial guesses from the prior, about z, degrees.
 const TURNS_DEG: [f64; 9] = [0.0, 4.0, -4.0, 8.0, -8.0, 12.0, -12.0, 16.0, -16.0];
@@ -68,17 +68,22 @@ pub(super) fn search(
         tried.collect()
     };
     let near = 0..NEAR;
-    let mut ends = tried(&starts(prior, |drive, turn| {
+    let [x, y] = [Vector3::x(), Vector3::y()];
+    let mut ends = tried(&starts(prior, x, |drive, turn| {
         near.contains(&drive) && turn == 0
     }));
     if !agree(&ends) {
         let turned = |drive, turn| near.contains(&drive) && near.contains(&turn) && turn > 0;
-        ends.extend(tried(&starts(prior, turned)));
+        ends.extend(tried(&starts(prior, x, turned)));
     }
     let is_doubtful = |(motion, _): &(_, _)| fit.upright_score(motion, &TRIAL) < UPRIGHT_PLAIN;
     if !agree(&ends) && ends.iter().all(is_doubtful) {
         let is_far = |drive, turn| !(near.contains(&drive) && near.contains(&turn));
-        ends.extend(tried(&starts(prior, is_far)));
+        ends.extend(tried(&starts(prior, x, is_far)));
+        // The y axis of some sensors is forward.
+        if ends.iter().all(is_doubtful) {
+            ends.extend(tried(&starts(prior, y, |drive, _| drive > 0)));
+        }
     }
     let mut best = (*prior, 0.0);
     for (motion, score) in ends {
@@ -101,15 +106,19 @@ fn agree(ends: &[(RigidTransform, f64)]) -> bool {
     })
 }
 
-/// The initial guesses about `prior` whose indices of translation and rotation `tries` accepts,
-/// those with the smallest rotation first.
-fn starts(prior: &RigidTransform, tries: impl Fn(usize, usize) -> bool) -> Vec<RigidTransform> {
+/// The initial guesses about `prior`, with translations along `axis`, whose indices of translation
+/// and rotation `tries` accepts, those with the smallest rotation first.
+fn starts(
+    prior: &RigidTransform,
+    axis: Vector3<f64>,
+    tries: impl Fn(usize, usize) -> bool,
+) -> Vec<RigidTransform> {
     let mut starts = Vec::new();
     for (turn, degrees) in TURNS_DEG.into_iter().enumerate() {
         for (drive, drive_m) in DRIVES_M.into_iter().enumerate() {
             if tries(drive, turn) {
                 let angle = Vector3::new(0.0, 0.0, degrees.to_radians());
-                starts.push(Isometry3::new(Vector3::new(drive_m, 0.0, 0.0), angle) * prior);
+                starts.push(Isometry3::new(drive_m * axis, angle) * prior);
             }
         }
     }

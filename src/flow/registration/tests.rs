@@ -162,6 +162,19 @@ fn five_metres_and_eight_degrees_are_found_from_rest_and_more_from_a_prior() {
 }
 
 #[test]
+fn ten_metres_are_found_whichever_axis_of_the_sensor_is_forward() {
+    let pair = street(1, None, None);
+    let drive = yaw([10.0, 0.5, 0.1], 3.0);
+    for turn in [yaw([0.0; 3], 0.0), yaw([0.0; 3], 90.0)] {
+        let truth = turn * drive * turn.inverse();
+        let aligned = moved(&pair.source, &(turn * pair.target_from_source));
+        let source = moved(&aligned, &truth.inverse());
+        let target = moved(&pair.target, &turn);
+        assert_near(&found(&source, &target), &truth, "from rest");
+    }
+}
+
+#[test]
 fn identical_clouds_do_not_move() {
     let target = street(5, None, None).target;
     let (meters, degrees) = gap(&found(&target, &target), &RigidTransform::identity());

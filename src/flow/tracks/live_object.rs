@@ -17,7 +17,7 @@ const HIDDEN_S: f32 = 1.0;
 const ACCELERATION: f32 = 12.0;
 /// Sweeps in which an object must move, one after the other, to be a track.
 const MOVING_SWEEPS: u32 = 3;
-/// Least distance that its center has come by then, metres.
+/// Least way that its velocities add up to by then, metres.
 const LEAST_WAY_M: f32 = 0.3;
 /// Largest difference of that way and its velocities' sum, relative to the sum.
 const WAY_DIFFERENCE: f32 = 0.5;

@@ -12,7 +12,7 @@ use super::arrays::{Array, KIND, declared_bytes, malformed};
 use super::filters::filters;
 use crate::flow::Point;
 use crate::formats::error::FormatError;
-use crate::formats::limits::{check_flag, check_value, unfold_limit};
+use crate::formats::limits::{check_flag, check_value, unfold_budget, unfold_limit};
 use crate::formats::pair::check_count;
 use crate::formats::point_times::{PointTimes, TimesColumn};
 
@@ -80,7 +80,7 @@ impl Scene {
         let declared = groups.fold(0, |sum: u64, group| {
             sum.saturating_add(declared_bytes(&group))
         });
-        if declared > limit as u64 {
+        if declared > unfold_budget(length) {
             return Err(KIND.too_large(format!(
                 "its arrays declare {declared} bytes, far more than a file of {length} bytes holds"
             )));

@@ -12,6 +12,8 @@ use crate::label::plan::{Drive, DriveSweep, drive_name, key_of, stem};
 const ENDINGS: [&str; 6] = [".pcd", ".ply", ".bin", ".npy", ".feather", ".las"];
 /// The deepest folder that is looked into.
 const MAX_DEPTH: usize = 12;
+/// What a file system keeps for itself.
+const LOST: &str = "lost+found";
 /// Where sweeps lie below a log of Argoverse 2.
 const AV2_SWEEPS: &str = "sensors/lidar";
 /// Where sweeps lie below a drive of KITTI.
@@ -62,7 +64,7 @@ pub(super) async fn drives(place: &Place, dataset: Dataset) -> Result<Vec<Drive>
             let below = folders
                 .into_iter()
                 .rev()
-                .filter(|name| !name.starts_with('_'));
+                .filter(|name| !name.starts_with('_') && name != LOST);
             let path = |name: String| match folder.is_empty() {
                 true => name,
                 false => format!("{folder}/{name}"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-import tempfile
+import uuid
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -65,18 +65,15 @@ class Pair:
 def put(path: str | os.PathLike[str], data: bytes) -> None:
     """Writes a file under a temporary name, then renames it: it is there whole, or not at all."""
     folder, name = os.path.split(os.path.abspath(path))
-    with tempfile.NamedTemporaryFile(dir=folder, prefix=f"{name[:40]}.", suffix=".part", delete=False) as file:
+    part = os.path.join(folder, f"{name[:40]}.{uuid.uuid4().hex}.part")
+    with open(part, "xb") as file:
         try:
             file.write(data)
             file.flush()
-            # Temporary files are private; the umask decides for this one.
-            umask = os.umask(0)
-            os.umask(umask)
-            os.chmod(file.name, 0o666 & ~umask)
-            os.replace(file.name, path)
+            os.replace(part, path)
         except BaseException:
             with contextlib.suppress(FileNotFoundError):
-                os.unlink(file.name)
+                os.unlink(part)
             raise
 
 

@@ -83,8 +83,10 @@ class Labeller:
             return report | {"outcome": "refused", "error": f"the key {key[:200]!r} is no name below the output"}
         began = time.monotonic()
         try:
-            path = f"{self._output}/{key}.{self._ending}"
-            if _exists(path):
+            # The key is a name, not a part of a URI: `%2e` is no dot.
+            filesystem, root = _filesystem(self._output)
+            path = f"{root}/{key}.{self._ending}"
+            if _exists(filesystem, path):
                 return report | {"outcome": "found"}
             first, second = _sweep(source), _sweep(target)
             times = None
@@ -95,7 +97,7 @@ class Labeller:
                 clocks = (_clock(first), _clock(second))
                 options = options | {"dt_s": _native.pair_interval((source, target), clocks)}
             found = flow(first.points, second.points, times=times, **options)
-            written = _put_new(path, found.to_bytes(self._ending))
+            written = _put_new(filesystem, path, found.to_bytes(self._ending))
         except REFUSED as error:
             return report | {"outcome": "refused", "error": str(error)}
         return report | {
@@ -121,10 +123,9 @@ def _filesystem(uri: str) -> tuple[Any, str]:
     return filesystem, path
 
 
-def _exists(uri: str) -> bool:
+def _exists(filesystem: Any, path: str) -> bool:
     from pyarrow import fs
 
-    filesystem, path = _filesystem(uri)
     return bool(filesystem.get_file_info(path).type == fs.FileType.File)
 
 
@@ -147,14 +148,13 @@ def _clock(sweep: Sweep) -> tuple[float, float | None] | None:
     return None if sweep.duration is None else (sweep.duration, sweep.time)
 
 
-def _put_new(uri: str, data: bytes) -> bool:
+def _put_new(filesystem: Any, path: str, data: bytes) -> bool:
     """Writes a file unless there is one; whether it was written. It is there whole, or not at all.
 
     In a bucket, two writers of one key write the same bytes, and the later one stays.
     """
     from pyarrow import fs
 
-    filesystem, path = _filesystem(uri)
     if not isinstance(filesystem, fs.LocalFileSystem):
         with filesystem.open_output_stream(path) as stream:
             stream.write(data)
