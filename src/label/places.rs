@@ -232,7 +232,7 @@ impl Place {
             return found.map_err(|error| PlaceError::new(&uri, error));
         }
         folder_entries(Path::new(&uri)).map_err(|error| match error.kind() {
-            ErrorKind::PermissionDenied => PlaceError::Unusable {
+            ErrorKind::PermissionDenied | ErrorKind::NotADirectory => PlaceError::Unusable {
                 source: error.into(),
                 uri,
             },
