@@ -16,7 +16,8 @@ const RECHECK: Duration = Duration::from_secs(5);
 /// A caller's subscription to a job.
 pub(super) struct JobWatch {
     service: Arc<Service>,
-    caller: Caller,
+    /// Who has subscribed.
+    pub(super) caller: Caller,
     /// The value of the header `authorization` that identifies the caller.
     authorization: Option<String>,
     news: watch::Receiver<Arc<Job>>,

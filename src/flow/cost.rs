@@ -5,8 +5,6 @@
 //! the number of multiply-adds that take equally long on a CPU. Independent of the device: a
 //! throughput in multiply-adds per second turns work into seconds.
 
-use std::collections::BTreeMap;
-
 use super::data::Point;
 use super::distance::DistanceTransform;
 use super::error::FlowError;
@@ -14,7 +12,7 @@ use super::field::{LAID_OUT, LinearGrid, PARAMETERS, chamfer_work, check_chamfer
 use super::options::{FieldOptions, LossOptions, Method, ModelOptions, Options};
 use super::problem::Problem;
 use super::select::{find_ground, select};
-use super::spatial::{NOISE, dbscan};
+use super::spatial::dbscan;
 
 /// Network passes per point and iteration: one forward pass, and a backward pass that costs two.
 const PASSES: f64 = 3.0;
@@ -241,12 +239,10 @@ fn cluster_points(source: &[Point], options: &FieldOptions) -> Option<usize> {
         Ok(thread) => thread.install(clusters),
         Err(_) => clusters(),
     };
-    let mut sizes: BTreeMap<u32, usize> = BTreeMap::new();
-    for label in labels.into_iter().filter(|&label| label != NOISE) {
-        *sizes.entry(label).or_default() += 1;
-    }
-    let squares: usize = sizes.values().map(|size| size * size).sum();
-    Some(squares / sizes.values().sum::<usize>().max(1))
+    let members = dbscan::members(&labels);
+    let sizes = || members.iter().map(Vec::len);
+    let squares: usize = sizes().map(|size| size * size).sum();
+    Some(squares / sizes().sum::<usize>().max(1))
 }
 
 /// The preparation of a target, and the queries of its distances in all iterations.

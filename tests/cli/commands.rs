@@ -196,39 +196,36 @@ fn wrong_arguments_are_refused_with_exit_code_2_before_any_work() {
     }
 }
 
-#[test]
-fn a_reader_that_goes_away_is_no_failure() {
+/// Runs the program with a stdout that nobody reads.
+fn without_reader(folder: &std::path::Path, arguments: &[&str]) -> std::process::Output {
     use std::process::{Command, Stdio};
     let mut child = Command::new(env!("CARGO_BIN_EXE_fnsf"))
-        .arg("doctor")
+        .current_dir(folder)
+        .args(arguments)
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
         .spawn()
         .expect("the program starts");
     drop(child.stdout.take());
-    let ended = child.wait_with_output().expect("the child is ours");
+    child.wait_with_output().expect("the child is ours")
+}
+
+#[test]
+fn a_reader_that_goes_away_is_no_failure() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let ended = without_reader(folder.path(), &["doctor"]);
     assert!(ended.status.success(), "{ended:?}");
     assert!(ended.stderr.is_empty(), "{ended:?}");
 }
 
 #[test]
 fn files_are_written_though_the_reader_of_the_lines_goes_away() {
-    use std::process::{Command, Stdio};
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     street(folder, "4");
-    let sweeps = (0..4).map(|sweep| format!("street/sweep_{sweep:04}.pcd"));
-    let mut child = Command::new(env!("CARGO_BIN_EXE_fnsf"))
-        .current_dir(folder)
-        .arg("flow")
-        .args(sweeps)
-        .args(["-o", "flow.npz"])
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .expect("the program starts");
-    drop(child.stdout.take());
-    let ended = child.wait_with_output().expect("the child is ours");
+    let sweeps = [0, 1, 2, 3].map(|sweep| format!("street/sweep_{sweep:04}.pcd"));
+    let sweeps = sweeps.each_ref().map(String::as_str);
+    let ended = without_reader(folder, &[&["flow", "-o", "flow.npz"][..], &sweeps].concat());
     assert!(ended.status.success(), "{ended:?}");
     let written = std::fs::read_dir(folder).expect("a folder");
     let written = written.filter(|file| {

@@ -39,6 +39,10 @@ pub(crate) fn file(format: CloudFormat, points: &[Point]) -> Vec<u8> {
     bytes
 }
 
+/// Options of a job that does not end by itself.
+pub(crate) const ENDLESS: &str =
+    r#"{"preset": "paper", "field": {"max_iterations": 1000000, "patience": 1000000}}"#;
+
 /// Sends a submission. Returns the JSON of the accepted job.
 pub(crate) async fn accepted(submission: RequestBuilder) -> Value {
     let answer = submission.send().await.expect("an answer");

@@ -27,7 +27,7 @@ fn pair_files(folder: &Path) -> Vec<PathBuf> {
     written(folder, medium_pair())
 }
 
-fn written(folder: &Path, pair: &[Vec<fnsf::flow::Point>; 2]) -> Vec<PathBuf> {
+pub(crate) fn written(folder: &Path, pair: &[Vec<fnsf::flow::Point>; 2]) -> Vec<PathBuf> {
     let names = ["a <b>bold.pcd", "b.pcd"];
     let pair = names.iter().zip(pair).map(|(name, points)| {
         let path = folder.join(name);
@@ -38,14 +38,14 @@ fn written(folder: &Path, pair: &[Vec<fnsf::flow::Point>; 2]) -> Vec<PathBuf> {
 }
 
 /// Drops the files of a pair, submits them, and waits for the picture of their flow.
-async fn submitted(browser: &Browser, server: &Server, files: &[PathBuf]) {
+pub(crate) async fn submitted(browser: &Browser, server: &Server, files: &[PathBuf]) {
     browser.open(&server.url("/")).await;
     browser.choose("files", files).await;
     browser.click("submit").await;
     browser.until("location.hash.startsWith('#/jobs/')").await;
 }
 
-async fn shows_flow(browser: &Browser) {
+pub(crate) async fn shows_flow(browser: &Browser) {
     let is_drawn = format!("{STATE}?.firstPictureMs && {STATE}.color === 'residual'");
     browser.until(&is_drawn).await;
     // One more picture, with what came last.

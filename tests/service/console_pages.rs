@@ -4,14 +4,11 @@
 use serde_json::json;
 
 use crate::browser::{Browser, Window};
-use crate::clouds::{accepted, file, form, medium_pair, small_pair};
+use crate::clouds::{ENDLESS, accepted, form, medium_pair, small_pair};
+use crate::console_browser::{shows_flow, submitted, written};
 use crate::server::{Folder, Server};
 
 const WIDE: Window = Window(1400, 1000);
-
-/// Options of a job that does not end by itself.
-const ENDLESS: &str =
-    r#"{"preset": "paper", "field": {"max_iterations": 1000000, "patience": 1000000}}"#;
 
 #[tokio::test]
 async fn the_focus_stays_while_a_page_is_updated() {
@@ -50,7 +47,7 @@ async fn the_focus_stays_while_a_page_is_updated() {
         .until("document.activeElement.getAttribute('role') === 'region'")
         .await;
 
-    // An open menu, and the page that a link has led to.
+    // The page that a link has led to, and a button of it.
     browser.open(&server.url(&format!("/#/jobs/{id}"))).await;
     browser.until("document.activeElement.id === 'page'").await;
     browser.until("document.title.startsWith('Job ')").await;
@@ -113,10 +110,7 @@ async fn an_upload_whose_page_is_left_goes_on_and_tells_its_job() {
     };
     let (server, folder) = (Server::start(&[]), Folder::new());
     browser.open(&server.url("/")).await;
-    let files = ["a.pcd", "b.pcd"].map(|name| folder.path().join(name));
-    for (path, points) in files.iter().zip(medium_pair()) {
-        std::fs::write(path, file(fnsf::formats::CloudFormat::Pcd, points)).expect("a file");
-    }
+    let files = written(folder.path(), medium_pair());
     browser.choose("files", &files).await;
     browser
         .run("document.querySelector(\"[data-test='submit']\").click(); location.hash = '#/jobs'")
@@ -128,8 +122,19 @@ async fn an_upload_whose_page_is_left_goes_on_and_tells_its_job() {
         .run("document.querySelector('.notice a').click()")
         .await;
     browser.find("downloads").await;
+    browser.check_peace(&[]).await;
+    browser.close().await;
+}
 
-    // The numbers of a moving object by the keyboard, and the picture as a file.
+#[tokio::test]
+async fn objects_are_picked_by_the_keyboard_hidden_points_by_nothing_and_pictures_have_their_legend()
+ {
+    let Some(browser) = Browser::start(WIDE, false).await else {
+        return;
+    };
+    let (server, folder) = (Server::start(&[]), Folder::new());
+    submitted(&browser, &server, &written(folder.path(), medium_pair())).await;
+    shows_flow(&browser).await;
     let viewer = "document.querySelector('.viewer').viewer";
     browser
         .until(&format!("{viewer}?.state.boxes.length > 0"))

@@ -6,7 +6,7 @@ use reqwest::{Client, StatusCode};
 use tokio_stream::StreamExt;
 use tonic::Code;
 
-use crate::clouds::{accepted, form, small_pair};
+use crate::clouds::{ENDLESS, accepted, form, small_pair};
 use crate::grpc::{self, proto};
 use crate::server::{Folder, Server};
 
@@ -56,10 +56,9 @@ async fn keys_are_exchanged_without_a_restart_and_two_are_valid_while_they_rotat
 async fn streams_of_events_end_with_the_key_of_their_reader() {
     let folder = Folder::new();
     let server = Server::start_in(&folder, &config(&[OLD, NEW]), &[]);
-    let long = r#"{"preset": "paper", "field": {"max_iterations": 1000000, "patience": 1000000}}"#;
     let job = Client::new()
         .post(server.url("/v1/jobs"))
-        .multipart(form(small_pair(), long))
+        .multipart(form(small_pair(), ENDLESS))
         .bearer_auth(NEW);
     let job = accepted(job).await;
     let id = job["id"].as_str().expect("an id").to_owned();

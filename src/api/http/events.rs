@@ -24,7 +24,6 @@ const HEARTBEAT: Duration = Duration::from_secs(15);
 
 /// The state of an event stream.
 struct Told {
-    caller: Caller,
     watch: JobWatch,
     last: Option<(JobState, u32, u32)>,
     ended: bool,
@@ -55,7 +54,6 @@ pub(super) async fn follow_job(
     let shown = shown.and_then(|value| value.to_str().ok());
     let watch = JobWatch::begin(&service, &caller, shown, id).await?;
     let told = Told {
-        caller,
         watch,
         last: None,
         ended: false,
@@ -81,9 +79,11 @@ async fn next(mut told: Told) -> Option<(Result<Event, Infallible>, Told)> {
     let id = format!("{}.{iteration}", job.attempt);
     let event = match job.progress {
         Some(progress) if same_state => Event::default().event("progress").json_data(progress),
-        _ => Event::default()
-            .event("state")
-            .json_data(JobView::shown_to(&told.caller, &job, &[])),
+        _ => Event::default().event("state").json_data(JobView::shown_to(
+            &told.watch.caller,
+            &job,
+            &[],
+        )),
     };
     let event = event.unwrap_or_default().id(id);
     Some((Ok(event), told))

@@ -16,9 +16,9 @@ use crate::flow::sequence::Sweep;
 ///
 /// `field` returns the motion field of each of [`Plan::edges`]. Points with a coordinate that is
 /// not finite, or of 1,000 km or more in magnitude, are left out. The points that a sweep's ground
-/// mask marks get no residual motion beside an ego motion. A sweep without a mask has no ground points. In the result
-/// the sweeps up to the reference time come first, earliest first, and then the later sweeps,
-/// latest first.
+/// mask marks get no residual motion where there is an ego motion. A sweep without a mask has no
+/// ground points. In the result the sweeps up to the reference time come first, earliest first, and
+/// then the later sweeps, latest first.
 ///
 /// `control` is checked before each sweep, and before each 131,072 points for which a motion field
 /// is evaluated.

@@ -24,7 +24,7 @@ const PIECE: usize = 1 << 17;
 pub(super) struct PropagatedCloud {
     points: Vec<Point>,
     sweep: Vec<u32>,
-    /// Marks ground points. They have no residual motion beside an ego motion.
+    /// Marks ground points. They have no residual motion where there is an ego motion.
     ground: Vec<bool>,
     dynamic: Vec<bool>,
     converged: Vec<bool>,
@@ -58,7 +58,7 @@ impl PropagatedCloud {
         substeps: usize,
     ) -> Result<(), DensifyError> {
         self.points = field.static_positions(&self.points);
-        let substeps = match field.residual.is_at_points() {
+        let substeps = match field.residual.is_known_at_points() {
             true => 1,
             false => substeps,
         };
@@ -188,7 +188,7 @@ impl PropagatedCloud {
     /// Rows of the points that a field may move: all but the ground. A function of space has the motion
     /// of the ground, too, where there is no ego motion.
     fn movable(&self, field: &MotionField) -> Vec<usize> {
-        let has_ground = field.ego.is_none() && !field.residual.is_at_points();
+        let has_ground = field.ego.is_none() && !field.residual.is_known_at_points();
         (0..self.points.len())
             .filter(|&row| !self.ground[row] || has_ground)
             .collect()

@@ -8,7 +8,7 @@
 //!
 //! Each step applies the ego motion exactly and integrates only the residual motion, so that the
 //! static world does not drift. Residuals below the threshold of motion are ignored. Ground points
-//! have no residual motion beside an ego motion.
+//! have no residual motion where there is an ego motion.
 
 mod accumulate;
 mod advect;

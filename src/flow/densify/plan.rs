@@ -64,8 +64,8 @@ impl Plan {
     /// 4 to sweep 5. `later` selects how the sweeps after it are transformed.
     ///
     /// Each step from one sweep to the next or the previous one takes `substeps` Euler steps of
-    /// equal length, or one where the motion is known at the source's points alone. The last, partial step to a reference time between two sweeps is a single
-    /// Euler step. Inverses of fields ([`LaterSweeps::Inverse`]) do not use `substeps`.
+    /// equal length, or one where the motion is known at the source's points alone. The last,
+    /// partial step to a reference time between two sweeps is a single Euler step. Inverses of fields ([`LaterSweeps::Inverse`]) do not use `substeps`.
     ///
     /// # Errors
     /// - [`PlanError::TooFewSweeps`] if there are fewer than two sweeps.

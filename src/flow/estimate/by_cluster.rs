@@ -16,7 +16,7 @@ use crate::flow::error::FlowError;
 use crate::flow::field::{self, Backend, Fit, Fitted};
 use crate::flow::motion::{Residual, SampledMotion};
 use crate::flow::options::{FieldOptions, PartitionOptions};
-use crate::flow::spatial::{NOISE, dbscan};
+use crate::flow::spatial::dbscan;
 
 /// A cluster with fewer points than this, or fewer candidates in the target, is static.
 const LEAST_POINTS: usize = 4;
@@ -222,13 +222,7 @@ impl Control for PartControl<'_> {
 /// The rows of the clusters of `source`, the largest first.
 fn clusters_of(source: &[Point], options: &PartitionOptions) -> Vec<Vec<u32>> {
     let labels = dbscan::clusters(source, options.radius_m, options.min_points);
-    let clusters = labels.iter().filter(|&&label| label != NOISE).max();
-    let mut rows = vec![Vec::new(); clusters.map_or(0, |&last| last as usize + 1)];
-    for (row, &label) in (0..).zip(&labels) {
-        if label != NOISE {
-            rows[label as usize].push(row);
-        }
-    }
+    let mut rows = dbscan::members(&labels);
     rows.sort_by_key(|rows| std::cmp::Reverse(rows.len()));
     rows
 }

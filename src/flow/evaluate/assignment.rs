@@ -94,7 +94,8 @@ mod tests {
 
     #[test]
     fn the_assignment_is_the_best_one_of_all_that_are_possible() {
-        // All assignments of 4 x 3 objects, of which some are far apart.
+        // The largest sum over all assignments of four rows to three columns. A weight of zero
+        // forbids a pair.
         fn best(weights: &[[f64; 3]; 4], row: usize, taken: [bool; 3]) -> f64 {
             if row == weights.len() {
                 return 0.0;

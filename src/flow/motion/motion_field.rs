@@ -35,9 +35,9 @@ pub enum Residual {
 }
 
 impl Residual {
-    /// Whether the motion is known at the source's points alone, and not as a function of space: a
-    /// position half a metre away from them does not move.
-    pub(crate) fn is_at_points(&self) -> bool {
+    /// Whether the motion is known at the source's points alone. A position half a metre away from
+    /// them does not move. Other motions are functions of space.
+    pub(crate) fn is_known_at_points(&self) -> bool {
         matches!(self, Self::Objects(_) | Self::Sampled(_))
     }
 

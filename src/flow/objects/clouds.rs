@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use crate::flow::data::Point;
 use crate::flow::options::ObjectOptions;
-use crate::flow::spatial::{ColumnIndex, NOISE, Neighborhood, SlotLabels, voxel_first};
+use crate::flow::spatial::{ColumnIndex, Neighborhood, SlotLabels, dbscan, voxel_first};
 
 /// Bound on the points of a column of an index. At the usual voxels a wall would have to be 58 m high.
 const MOST_IN_A_COLUMN: usize = 4096;
@@ -16,7 +16,7 @@ const MOST_IN_A_COLUMN: usize = 4096;
 pub(super) struct SourceCloud {
     /// One point a voxel, metres in the target's frame.
     pub(super) points: Vec<Point>,
-    /// The cluster of each point, or [`NOISE`].
+    /// The cluster of each point, or [`NOISE`](crate::flow::spatial::NOISE).
     pub(super) labels: Vec<u32>,
     /// For each cluster, the indices of its points in `points`.
     pub(super) members: Vec<Vec<u32>>,
@@ -46,20 +46,13 @@ impl SourceCloud {
         let labels: Vec<u32> = kept.iter().map(|&row| labels[row as usize]).collect();
         let points: Vec<Point> = kept.iter().map(|&row| source[row as usize]).collect();
         let low: Vec<Point> = points.iter().map(|&p| lowered(p, options)).collect();
-        let clusters = labels.iter().filter(|&&label| label != NOISE).max();
-        let mut members = vec![Vec::new(); clusters.map_or(0, |&last| last as usize + 1)];
-        for (&label, row) in labels.iter().zip(0..) {
-            if label != NOISE {
-                members[label as usize].push(row);
-            }
-        }
         let near = ColumnIndex::new(&low, column_m(options));
         Self {
             clusters: near.labels(&labels),
             near,
             points,
+            members: dbscan::members(&labels),
             labels,
-            members,
             low,
         }
     }

@@ -24,6 +24,18 @@ const PARTS: usize = 32;
 /// Label of a point that belongs to no cluster.
 pub(crate) const NOISE: u32 = u32::MAX;
 
+/// The rows of each cluster, in order, from the `labels` of N points as [`clusters`] gives them.
+pub(crate) fn members(labels: &[u32]) -> Vec<Vec<u32>> {
+    let clusters = labels.iter().filter(|&&label| label != NOISE).max();
+    let mut members = vec![Vec::new(); clusters.map_or(0, |&last| last as usize + 1)];
+    for (row, &label) in (0..).zip(labels) {
+        if label != NOISE {
+            members[label as usize].push(row);
+        }
+    }
+    members
+}
+
 /// DBSCAN clusters of `points`, metres: N labels, numbered from 0 in the order of each cluster's
 /// first point, or [`NOISE`]. A point with at least `least` points within `radius_m` metres, itself
 /// included, is a core point. Core points within the radius of each other are in one cluster. Any

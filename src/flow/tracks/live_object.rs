@@ -19,7 +19,7 @@ const ACCELERATION: f32 = 12.0;
 const MOVING_SWEEPS: u32 = 3;
 /// Least way that its velocities add up to by then, metres.
 const LEAST_WAY_M: f32 = 0.3;
-/// Largest difference of that way and its velocities' sum, relative to the sum.
+/// Largest difference between the way of its center and that of its velocities, relative to the latter.
 const WAY_DIFFERENCE: f32 = 0.5;
 /// Least height of a track, metres. Flatter objects are rings on the ground that an object hides.
 const LEAST_HEIGHT_M: f32 = 0.3;
