@@ -41,24 +41,23 @@ export async function jobPage(page, signal, id) {
 async function follow(job, path, signal, parts, show) {
   let latest = job;
   let asked = 0;
-  const take = (job) => {
+  let shown = 0;
+  const take = (job, number) => {
+    shown = number;
     latest = job;
     show(job);
   };
   const look = async () => {
     const number = (asked += 1);
     const job = await json(path, { signal });
-    // An answer that comes late is older than what is shown.
-    if (number === asked) take(job);
+    // An answer that comes late may be older than what is shown.
+    if (number > shown) take(job, number);
   };
   const onEvent = (name, data) => {
     if (name === "progress") showProgress(parts.head, data);
     // The event of a sequence does not list its pairs, and that of a queued job not how long it waits.
     else if (data.kind === "sequence" || data.state === "queued") look().catch(() => {});
-    else {
-      asked += 1;
-      take(data);
-    }
+    else take(data, (asked += 1));
   };
   const lookAtQueued = () => (latest.state === "queued" ? look() : Promise.resolve());
   repeat(LOOK_SECONDS, signal, lookAtQueued, () => {}).catch(() => {});

@@ -436,7 +436,9 @@ export class Viewer {
     if (boxes.length === 0) return;
     const isPicked = ({ id, cluster }) => (id === null ? cluster === picked?.cluster : id === picked?.id);
     const next = boxes[(boxes.findIndex(isPicked) + 1) % boxes.length];
-    this.pickObject(this.objects.find(({ id, cluster }) => id === next.id && cluster === next.cluster));
+    const object = this.objects.find(({ id, cluster }) => id === next.id && cluster === next.cluster);
+    // The boxes of the sweep before stay until the next one is drawn.
+    if (object) this.pickObject(object);
   }
 
   /** Shows the numbers of an object whose label was clicked. */

@@ -137,11 +137,15 @@ async fn nodes(State(admin): State<Admin>) -> Response {
     }
 }
 
+/// Time after which the metrics are shown without what the queue does not answer. Prometheus gives up
+/// a scrape after 10 s, or after its interval.
+const LONGEST_READ: Duration = Duration::from_secs(1);
+
 async fn expose(State(admin): State<Admin>, headers: HeaderMap) -> Response {
-    let oldest = match admin.queue.oldest_queued().await {
-        Ok(Some(oldest)) => Some(oldest.until(Timestamp::now())),
-        Ok(None) => Some(Duration::ZERO),
-        Err(_) => None,
+    let oldest = match tokio::time::timeout(LONGEST_READ, admin.queue.oldest_queued()).await {
+        Ok(Ok(Some(oldest))) => Some(oldest.until(Timestamp::now())),
+        Ok(Ok(None)) => Some(Duration::ZERO),
+        Ok(Err(_)) | Err(_) => None,
     };
     let backlog = admin.queue.backlog();
     let work_seconds = admin.cost.seconds(backlog.queued().seconds);

@@ -167,23 +167,35 @@ fn with_report(json: &[u8], report: &Report, job: &str) -> Result<Vec<u8>, ApiEr
     Ok(bytes)
 }
 
-/// Upper bound on the memory of the decoded clouds of a file: 12 bytes for a point and one for its
-/// mask, for each row that the file declares, and what decoding holds beside them.
+/// Upper bounds on the memory that a file takes beside its own bytes.
+pub(super) struct DecodingMemory {
+    /// Bytes of the decoded clouds: 12 for a point and one for its mask, for each row that the file
+    /// declares.
+    pub(super) clouds: u64,
+    /// Bytes that are held only while the file is decoded. Zero for a file with too many points,
+    /// which is refused before.
+    pub(super) meanwhile: u64,
+}
+
+/// The memory that decoding a file takes, with at most `most` points in a cloud.
 ///
 /// # Errors
 /// [`ApiError::BadInput`] or [`ApiError::TooLarge`], with the name of the part and the defect.
-pub(super) fn unfolded_bytes(
+pub(super) fn decoding_memory(
     part: &str,
     bytes: &[u8],
     name: Option<&str>,
     most: usize,
-) -> Result<u64, ApiError> {
+) -> Result<DecodingMemory, ApiError> {
     const ROW: u64 = size_of::<crate::flow::Point>() as u64 + 1;
     let rows = formats::declared_rows(bytes, name).map_err(|error| in_part(part, error))?;
     // A file with several arrays is read up to two clouds and their two masks.
-    let points = rows.min(4 * most) as u64 * ROW;
-    let working = formats::working_bytes(bytes, name).map_err(|error| in_part(part, error))?;
-    Ok(points.saturating_add(working))
+    let clouds = rows.min(4 * most) as u64 * ROW;
+    let meanwhile = match rows > most {
+        true => 0,
+        false => formats::working_bytes(bytes, name).map_err(|error| in_part(part, error))?,
+    };
+    Ok(DecodingMemory { clouds, meanwhile })
 }
 
 /// Decodes one cloud in any supported format, with at most `most` points.

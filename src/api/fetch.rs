@@ -58,8 +58,13 @@ impl Service {
         let tenant = room.tenant().clone();
         let decode = move || {
             // A small compressed file may decode to a large cloud.
-            room.hold(codec::unfolded_bytes(&part, &bytes, name.as_deref(), most)?)?;
+            let memory = codec::decoding_memory(&part, &bytes, name.as_deref(), most)?;
+            room.check(memory.clouds.saturating_add(memory.meanwhile))?;
+            room.hold(memory.clouds)?;
+            let mut meanwhile = room.another();
+            meanwhile.hold(memory.meanwhile)?;
             let cloud = codec::read_cloud(&part, &bytes, name.as_deref(), most)?;
+            drop(meanwhile);
             Ok((cloud, room))
         };
         self.compute(&tenant, decode).await

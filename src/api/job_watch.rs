@@ -57,7 +57,7 @@ impl JobWatch {
     /// - [`ApiError::Draining`] if the server closes its streams.
     /// - [`ApiError::NotFound`] if the job is gone.
     /// - [`ApiError::Unauthenticated`] or [`ApiError::LinkExpired`] if the caller's key or link is
-    ///   not valid any more, or means another caller.
+    ///   not valid any more, or belongs to another tenant or job.
     pub(super) async fn changed(&mut self) -> Result<(), ApiError> {
         let closing = self.service.closing.clone();
         loop {
@@ -66,9 +66,13 @@ impl JobWatch {
                 changed = tokio::time::timeout(RECHECK, self.news.changed()) => changed,
             };
             let keys = self.service.keys.get();
-            if keys.caller(self.authorization.as_deref())? != self.caller {
+            let caller = keys.caller(self.authorization.as_deref())?;
+            // A key may get other rights.
+            if (&caller.tenant, caller.shared_job) != (&self.caller.tenant, self.caller.shared_job)
+            {
                 return Err(ApiError::Unauthenticated);
             }
+            self.caller = caller;
             if let Ok(changed) = changed {
                 return changed.map_err(|_| ApiError::NotFound);
             }

@@ -183,6 +183,13 @@ impl Service {
         self.draining.store(true, Ordering::Relaxed);
     }
 
+    /// Waits until no call waits for a job that is not durable.
+    pub async fn calls_are_answered(&self) {
+        while !self.waiters.are_none() {
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+    }
+
     /// Ends event streams and long polls. In a shutdown it follows [`Service::stop_accepting`].
     pub fn close_streams(&self) {
         self.closing.cancel();

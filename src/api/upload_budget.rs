@@ -169,7 +169,7 @@ impl UploadReservation {
     /// Adds `bytes` received bytes to the reservation and to the time credit.
     ///
     /// # Errors
-    /// [`ApiError::TooLarge`] if the body exceeds its limit, [`ApiError::ServerFull`] if the budget
+    /// [`ApiError::TooLarge`] if the body exceeds its limit or the whole budget, [`ApiError::ServerFull`] if the budget
     /// of all bodies or of the tenant is exhausted.
     pub(super) fn take(&mut self, bytes: usize) -> Result<(), ApiError> {
         let limits = self.uploads.limits;
@@ -187,11 +187,30 @@ impl UploadReservation {
         self.hold(self.bytes)
     }
 
+    /// Checks that `bytes` bytes are there when nothing else is held.
+    ///
+    /// # Errors
+    /// [`ApiError::TooLarge`].
+    pub(super) fn check(&self, bytes: u64) -> Result<(), ApiError> {
+        let UploadLimits { all, tenant, .. } = self.uploads.limits;
+        let most = all.min(tenant);
+        if bytes <= most {
+            return Ok(());
+        }
+        Err(ApiError::TooLarge(format!(
+            "it takes {} MiB of memory, and this server has {} MiB for the uploads of a tenant",
+            bytes.div_ceil(1 << 20),
+            most >> 20
+        )))
+    }
+
     /// Extends the reservation to `bytes` bytes: the body so far, or the size of the decoded cloud.
     ///
     /// # Errors
-    /// [`ApiError::ServerFull`].
+    /// [`ApiError::TooLarge`] where the budget never has as much, [`ApiError::ServerFull`] where
+    /// others hold it.
     pub(super) fn hold(&mut self, bytes: u64) -> Result<(), ApiError> {
+        self.check(bytes)?;
         let limits = self.uploads.limits;
         // Rounded up for the total of the body, so that small chunks do not cost more than large
         // ones.

@@ -50,6 +50,12 @@ impl Waiters {
         locked(&self.waiting)
     }
 
+    /// Whether no call waits for a job.
+    pub(super) fn are_none(&self) -> bool {
+        let waiting = self.lock();
+        !waiting.values().any(|one| matches!(one, Waiting::For(_)))
+    }
+
     /// Registers one more waiter for a job of `queue`.
     ///
     /// # Errors

@@ -25,11 +25,14 @@ impl App {
     ///    until 1 s before the deadline. An object search is not interrupted, nor is a fit that its
     ///    deadline has shortened. A durable job that does not stop in time is queued again at the
     ///    next start.
-    /// 4. Event streams and long polls end, and the listener closes. Open connections have 1 s to
+    /// 4. Where the queue is PostgreSQL, calls that wait for a job of another node have until 3 s
+    ///    before the deadline.
+    /// 5. Event streams and long polls end, and the listener closes. Open connections have 1 s to
     ///    send their responses, but not beyond the deadline.
-    /// 5. Background tasks end, and the queue records the graceful shutdown.
+    /// 6. Background tasks end, and the queue records the graceful shutdown, within 1 s after the
+    ///    deadline.
     ///
-    /// Steps 2 to 4 end early when nothing is left to wait for. The admin port answers until the
+    /// Steps 2 to 5 end early when nothing is left to wait for. The admin port answers until the
     /// process ends.
     pub async fn drain(mut self) {
         let began = Instant::now();
@@ -55,6 +58,12 @@ impl App {
                 tracing::warn!("a job did not stop in time; its lease ends with the process");
             }
         }
+        if self.config.queue.postgres.is_some() {
+            let answered = self.service.calls_are_answered();
+            if timeout_at(to_finish, answered).await.is_err() {
+                tracing::info!("calls whose jobs are not done in time end without them");
+            }
+        }
         self.service.close_streams();
         self.stop_listening.cancel();
         let closing = deadline.min(Instant::now() + TO_CLOSE);
@@ -64,7 +73,10 @@ impl App {
             self.listener.abort();
         }
         self.upkeep.shutdown().await;
-        self.queue.stopped().await;
+        let last = deadline.max(Instant::now()) + TO_CLOSE;
+        if timeout_at(last, self.queue.stopped()).await.is_err() {
+            tracing::warn!("the queue did not record the shutdown");
+        }
         tracing::info!(seconds = began.elapsed().as_secs_f64(), "stopped");
     }
 }

@@ -302,14 +302,18 @@ impl Surroundings {
         self.forgotten += count;
     }
 
-    /// The options with the time between the two sweeps of a pair, where the options do not give it.
-    pub(super) fn timed(&self, options: &JobOptions, [source, target]: [usize; 2]) -> JobOptions {
-        let mut options = options.clone();
-        let pair = [source, target];
+    /// Seconds from the source of a pair to its target, see [`pair_interval_s`].
+    fn interval_s(&self, pair: [usize; 2]) -> Option<f32> {
         let known = pair.map(|sweep| self.known.get(sweep.checked_sub(self.forgotten)?));
         let names = known.map(|sweep| sweep.map_or("", |sweep| sweep.name.as_str()));
-        let clocks = known.map(|sweep| sweep?.clock);
-        options.dt_s = options.dt_s.or_else(|| pair_interval_s(names, clocks));
+        pair_interval_s(names, known.map(|sweep| sweep?.clock))
+    }
+
+    /// The options with the time between the two sweeps of a pair, where the options do not give it.
+    pub(super) fn timed(&self, options: &JobOptions, pair: [usize; 2]) -> JobOptions {
+        let mut options = options.clone();
+        let known = || Some(self.interval_s(pair)?.abs());
+        options.dt_s = options.dt_s.or_else(known);
         options
     }
 
@@ -321,7 +325,9 @@ impl Surroundings {
         points: usize,
         [source, target]: [usize; 2],
     ) -> flow::Options {
-        let mut options = self.timed(options, [source, target]).solver_options(points);
+        let pair = [source, target];
+        let mut options = self.timed(options, pair).solver_options(points);
+        options.newest_first = self.interval_s(pair).is_some_and(f32::is_sign_negative);
         if let Some(poses) = &self.poses {
             options.ego = Ego::Given(poses[target].inv_mul(&poses[source]));
         }

@@ -28,6 +28,17 @@ pub(super) fn say(line: fmt::Arguments<'_>) -> Result<(), Failure> {
     without_reader(show(line))
 }
 
+/// Prints one line on stdout, of a command that ends with its reader unless it `writes` files too.
+///
+/// # Errors
+/// As [`show`] or [`say`].
+pub(super) fn tell(writes: bool, line: fmt::Arguments<'_>) -> Result<(), Failure> {
+    match writes {
+        true => say(line),
+        false => show(line),
+    }
+}
+
 /// The result of [`show`] in a command that goes on without a reader.
 pub(super) fn without_reader(shown: Result<(), Failure>) -> Result<(), Failure> {
     match shown {

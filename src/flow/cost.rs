@@ -128,7 +128,8 @@ pub fn predict_cost(problem: &Problem, options: &Options) -> Result<Cost, FlowEr
         Method::Field(field) => {
             let [source, target] =
                 [&selection.source, &selection.target].map(|cloud| field.seen(cloud));
-            field_cost([&source, &target], field)?
+            let cluster = cluster_points(&selection.source, field);
+            field_cost([&source, &target], field, cluster)?
         }
     };
     let registered = selection.registration_clouds.iter().flatten();
@@ -187,12 +188,15 @@ fn object_cost(points: usize) -> MethodCost {
     }
 }
 
-/// The preparation of the target, and the fit of a field.
-fn field_cost(clouds: [&[Point]; 2], options: &FieldOptions) -> Result<MethodCost, FlowError> {
+/// The preparation of the target, and the fit of a field. `cluster` is as [`cluster_points`] gives it.
+fn field_cost(
+    clouds: [&[Point]; 2],
+    options: &FieldOptions,
+    cluster: Option<usize>,
+) -> Result<MethodCost, FlowError> {
     let [source, _] = clouds;
     let batch = options.batch.unwrap_or(source.len()).min(source.len());
     let iterations = options.expected_iterations() as f64;
-    let cluster = cluster_points(source, options);
     let mut cost = target_cost(clouds, batch, options, cluster)?;
     if options.consistency_weight > 0.0 {
         let others = cluster.map_or(batch, |points| batch.min(points)) as f64;

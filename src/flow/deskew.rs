@@ -21,16 +21,16 @@ const TRUNCATION_M: f32 = 0.3;
 /// The points of a sweep in the sensor's frame of the sweep's time.
 ///
 /// `points` are N points in metres, each in the sensor's frame of its own time. `times` are N times
-/// in seconds after the sweep's time. `ego` is the motion of the sensor in `dt_s` seconds,
-/// later_from_earlier.
+/// in seconds after the sweep's time. `ego` is the motion of the sensor in `elapsed_s` seconds,
+/// target_from_source. It is below zero where the target is the earlier sweep.
 pub(crate) fn deskewed(
     points: &[Point],
     times: &[f32],
     ego: &RigidTransform,
-    dt_s: f32,
+    elapsed_s: f32,
 ) -> Vec<Point> {
     let screw = Screw::of(&ego.inverse());
-    let share = |time: f32| f64::from(time) / f64::from(dt_s);
+    let share = |time: f32| f64::from(time) / f64::from(elapsed_s);
     let move_back = |(&point, &time)| transform_point(&screw.at(share(time)), point);
     points.par_iter().zip(times).map(move_back).collect()
 }
@@ -119,6 +119,11 @@ mod tests {
         let off = farthest(&found, &expected);
         assert!(off < TOLERANCE_M, "{off}");
         assert!(farthest(&first.points, &expected) > 1.5);
+        // From the later sweep to the earlier one.
+        let times = second.times.clone().expect("a rolling sweep");
+        let found = deskewed(&second.points, &times, &ego.inverse(), -0.1);
+        let off = farthest(&found, &street.deskewed(&second));
+        assert!(off < TOLERANCE_M, "{off}");
     }
 
     #[test]

@@ -12,6 +12,7 @@ use super::error::{FileKind, FormatError, shorten};
 use super::feather;
 use super::feather::Table;
 use super::motion::rigid_motion;
+use super::timestamps::SweepTime;
 use crate::flow::RigidTransform;
 
 const KIND: FileKind = FileKind::Poses;
@@ -185,8 +186,9 @@ fn read_av2(bytes: &[u8], sweeps: &[&str]) -> Result<Vec<RigidTransform>, Format
     let table = Table::open(bytes)?;
     let time = |frame: &&str| {
         // Nanoseconds in float64, as `Table::each` gives them.
-        let time = stem(frame).parse::<i64>().map(|time| time as f64);
-        time.map_err(|_| {
+        let stamp = SweepTime::from_name(frame).and_then(SweepTime::nanoseconds);
+        let stamp = stamp.or_else(|| stem(frame).parse().ok());
+        stamp.map(|time| time as f64).ok_or_else(|| {
             FileKind::Feather.unsupported(format!(
                 "poses are found by time stamp, and the sweep {} is not named by one",
                 shorten(frame)

@@ -43,9 +43,10 @@ pub struct SweepClock {
     pub sweep_s: Option<f64>,
 }
 
-/// Seconds between the two sweeps of a pair, by what is known of them. It is the difference of the
-/// timestamps in their `names`, else of the sensor's clock, else the duration of the source, because a
-/// spinning lidar does not pause between two turns. None if nothing is known.
+/// Seconds from the source of a pair to its target, by what is known of them. It is the difference of
+/// the timestamps in their `names`, else of the sensor's clock, else the duration of the source,
+/// because a spinning lidar does not pause between two turns. It is below zero where the target was
+/// measured first. None if nothing is known.
 pub fn pair_interval_s(names: [&str; 2], clocks: [Option<SweepClock>; 2]) -> Option<f32> {
     let [source, target] = names.map(SweepTime::from_name);
     let by_names = source.zip(target);
@@ -55,8 +56,9 @@ pub fn pair_interval_s(names: [&str; 2], clocks: [Option<SweepClock>; 2]) -> Opt
             let [source, target] = clocks;
             let (source, target) = source.zip(target)?;
             let apart = source.sweep_s.zip(target.sweep_s);
-            let apart = apart.map(|(source, target)| (target - source).abs());
-            let is_interval = |&seconds: &f64| seconds > 0.0 && seconds <= MAX_INTERVAL_S;
+            let apart = apart.map(|(source, target)| target - source);
+            let is_interval =
+                |seconds: &f64| seconds.abs() > 0.0 && seconds.abs() <= MAX_INTERVAL_S;
             let apart = apart.filter(is_interval);
             let seconds = apart.unwrap_or(source.duration_s);
             is_interval(&seconds).then_some(seconds as f32)
@@ -104,13 +106,14 @@ impl SweepTime {
         self.ticks.checked_mul(self.unit.nanoseconds())
     }
 
-    /// Seconds between two sweeps, in either order. None if the units differ, the times are the
-    /// same, or they are more than 60 s apart.
+    /// Seconds from this sweep to another, below zero where the other is the earlier one. None if the
+    /// units differ, the times are the same, or they are more than 60 s apart.
     pub fn interval_s(self, other: Self) -> Option<f32> {
         let ticks = self.ticks.abs_diff(other.ticks) as f64;
         let seconds = ticks * self.unit.nanoseconds() as f64 * 1e-9;
         let is_interval = self.unit == other.unit && seconds > 0.0 && seconds <= MAX_INTERVAL_S;
-        is_interval.then_some(seconds as f32)
+        let sign = if other.ticks < self.ticks { -1.0 } else { 1.0 };
+        is_interval.then_some(sign * seconds as f32)
     }
 }
 
@@ -131,7 +134,7 @@ mod tests {
                 "n015__LIDAR_TOP__1532402927697731.pcd.bin",
                 Some(0.049_78),
             ),
-            ("1700000000200.ply", "1700000000100.ply", Some(0.1)),
+            ("1700000000200.ply", "1700000000100.ply", Some(-0.1)),
             (
                 "scan_1617179420.100000000.pcd",
                 "scan_1617179420.150000000.pcd",

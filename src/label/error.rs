@@ -43,8 +43,9 @@ pub enum LabelError {
     /// The settings of the output cannot be read.
     #[error("{0} cannot be read: {1}")]
     BadRun(String, String),
-    /// A sweep has no pose, and the ego motion is to come from poses.
-    #[error("{0} has no pose: leave out --known-poses, or give every sweep of the manifest one")]
+    /// A sweep has no pose, and the ego motion is to come from poses. The text says which sweep, or
+    /// which file of poses cannot be read.
+    #[error("{0}: leave out --known-poses, or give every sweep of the manifest one")]
     NoPose(String),
     /// The output does not keep the first of two writers.
     #[error(

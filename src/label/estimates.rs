@@ -10,7 +10,7 @@ use super::types::Solver;
 use crate::flow::tracks::{Tracker, push_and_correct};
 use crate::flow::{Control, Ego, Estimate, FlowError, Point, WindowedPair, window};
 use crate::formats::{SweepClock, pair_interval_s, read_av2_mask, write_tracks};
-use crate::job::{JobOptions, MAX_DT_S};
+use crate::job::MAX_DT_S;
 
 /// The estimates, in order, with the sweeps that they need.
 pub(super) struct Estimates<'a> {
@@ -102,9 +102,12 @@ impl Estimates<'_> {
         let mask = self.mask(wanted)?;
         let pair = [wanted.pair, wanted.pair + 1];
         let [source, target] = pair.map(|index| loaded(index).expect("both sweeps were read"));
-        let options = self.options(wanted, [source.clock, target.clock]);
+        let apart_s = self.interval_s(wanted, [source.clock, target.clock]);
+        let mut options = inputs.options.clone();
+        options.dt_s = options.dt_s.or(apart_s.map(f32::abs));
         let larger = source.points.len().max(target.points.len());
         let mut solver_options = options.solver_options(larger);
+        solver_options.newest_first = apart_s.is_some_and(f32::is_sign_negative);
         if inputs.poses {
             let poses = pair.map(|index| drive.sweeps[index].pose.unwrap_or_default());
             solver_options.ego = Ego::Given(poses[1].inv_mul(&poses[0]));
@@ -174,18 +177,16 @@ impl Estimates<'_> {
             .map_err(|error| (Outcome::Refused, format!("its mask: {error}")))
     }
 
-    /// The options of a pair, with the time between its sweeps.
-    fn options(&self, wanted: &Wanted, clocks: [Option<SweepClock>; 2]) -> JobOptions {
-        let mut options = self.io.inputs.options.clone();
+    /// Seconds from the source of a pair to its target; below zero where the target was measured
+    /// first. None where no time is known.
+    fn interval_s(&self, wanted: &Wanted, clocks: [Option<SweepClock>; 2]) -> Option<f32> {
         let sweeps = &self.io.inputs.plan.drives()[wanted.drive].sweeps[wanted.pair..];
         let times = sweeps[0].time_s.zip(sweeps[1].time_s);
-        let apart = times.map(|(source, target)| (target - source).abs() as f32);
+        let apart = times.map(|(source, target)| (target - source) as f32);
         let names = [&sweeps[0].uri, &sweeps[1].uri].map(String::as_str);
-        options.dt_s = options
-            .dt_s
-            .or(apart.filter(|&apart| apart > 0.0 && apart <= MAX_DT_S))
-            .or_else(|| pair_interval_s(names, clocks));
-        options
+        apart
+            .filter(|apart| apart.abs() > 0.0 && apart.abs() <= MAX_DT_S)
+            .or_else(|| pair_interval_s(names, clocks))
     }
 
     fn put(

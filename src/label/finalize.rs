@@ -94,11 +94,12 @@ pub fn finalize(
         for (drive, pair) in plan.all_pairs().filter(|&(_, pair)| layout.asks_for(pair)) {
             let of = &plan.drives()[drive];
             let key = of.key(pair);
-            let is_there = all.contains(&layout.path(&of.name, pair, &key))
-                && (!whole || all.contains(&tracks_path(&of.name)));
+            let has_flow = all.contains(&layout.path(&of.name, pair, &key));
+            let is_there = has_flow && (!whole || all.contains(&tracks_path(&of.name)));
             let last = latest.get(&key);
             let report = labelled.get(&key).filter(|_| is_there).or(last);
-            let refused = last.filter(|report| report.outcome == Outcome::Refused);
+            // A flow without the tracks of its drive is of a run that was interrupted.
+            let refused = last.filter(|last| !has_flow && last.outcome == Outcome::Refused);
             found.pairs += 1;
             let outcome = match (is_there, refused) {
                 (true, _) => {

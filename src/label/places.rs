@@ -282,8 +282,14 @@ impl Place {
     }
 }
 
+/// Whether a link leads to nothing that exists, or in a circle.
+fn leads_nowhere(error: &io::Error) -> bool {
+    error.kind() == ErrorKind::NotFound
+        || rustix::io::Errno::from_io_error(error) == Some(rustix::io::Errno::LOOP)
+}
+
 /// The names of the folders and of the files in a folder of this machine, each in order; none if there
-/// is no such folder. Links are what they lead to, and files where they lead nowhere.
+/// is no such folder. Links are what they lead to, and files where they lead nowhere or to themselves.
 fn folder_entries(folder: &Path) -> io::Result<[Vec<String>; 2]> {
     let (mut folders, mut files) = (Vec::new(), Vec::new());
     let listed = match fs::read_dir(folder) {
@@ -296,7 +302,15 @@ fn folder_entries(folder: &Path) -> io::Result<[Vec<String>; 2]> {
             let message = format!("the name {} is no UTF-8", name.display());
             io::Error::new(ErrorKind::InvalidFilename, message)
         })?;
-        match fs::metadata(entry.path()).is_ok_and(|about| about.is_dir()) {
+        let mut kind = entry.file_type()?;
+        if kind.is_symlink() {
+            match fs::metadata(entry.path()) {
+                Ok(about) => kind = about.file_type(),
+                Err(error) if leads_nowhere(&error) => {}
+                Err(error) => return Err(error),
+            }
+        }
+        match kind.is_dir() {
             true => folders.push(name),
             false => files.push(name),
         }

@@ -24,9 +24,20 @@ pub struct Drive {
     pub name: String,
     /// Two sweeps or more, in the order in which they were recorded.
     pub sweeps: Vec<DriveSweep>,
+    /// Why the poses of the drive cannot be read, where they are there.
+    pub bad_poses: Option<String>,
 }
 
 impl Drive {
+    /// A drive whose poses, where it has any, are with its sweeps.
+    pub fn new(name: String, sweeps: Vec<DriveSweep>) -> Self {
+        Self {
+            name,
+            sweeps,
+            bad_poses: None,
+        }
+    }
+
     /// Number of pairs.
     pub fn pairs(&self) -> usize {
         self.sweeps.len().saturating_sub(1)
@@ -199,10 +210,7 @@ mod tests {
             pose: None,
             time_s: None,
         };
-        Drive {
-            name: name.to_owned(),
-            sweeps: keys.iter().map(sweep).collect(),
-        }
+        Drive::new(name.to_owned(), keys.iter().map(sweep).collect())
     }
 
     #[test]

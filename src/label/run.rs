@@ -154,9 +154,13 @@ pub fn run(
     let began = Instant::now();
     check_outputs(inputs.plan, inputs.layout, inputs.tracks)?;
     if inputs.poses {
-        let sweeps = inputs.plan.drives().iter().flat_map(|drive| &drive.sweeps);
-        if let Some(sweep) = sweeps.into_iter().find(|sweep| sweep.pose.is_none()) {
-            return Err(LabelError::NoPose(sweep.uri.clone()));
+        for drive in inputs.plan.drives() {
+            if let Some(sweep) = drive.sweeps.iter().find(|sweep| sweep.pose.is_none()) {
+                let none = || format!("{} has no pose", sweep.uri);
+                return Err(LabelError::NoPose(
+                    drive.bad_poses.clone().unwrap_or_else(none),
+                ));
+            }
         }
     }
     let runtime = runtime()?;

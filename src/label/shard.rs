@@ -121,16 +121,14 @@ mod tests {
     use crate::label::plan::{Drive, DriveSweep};
 
     fn plan(sizes: &[usize]) -> Plan {
-        let drive = |(index, &size): (usize, &usize)| Drive {
-            name: index.to_string(),
-            sweeps: (0..size)
-                .map(|sweep| DriveSweep {
-                    uri: String::new(),
-                    key: sweep.to_string(),
-                    pose: None,
-                    time_s: None,
-                })
-                .collect(),
+        let sweep = |sweep: usize| DriveSweep {
+            uri: String::new(),
+            key: sweep.to_string(),
+            pose: None,
+            time_s: None,
+        };
+        let drive = |(index, &size): (usize, &usize)| {
+            Drive::new(index.to_string(), (0..size).map(sweep).collect())
         };
         Plan::new(sizes.iter().enumerate().map(drive).collect()).expect("a plan")
     }

@@ -147,6 +147,8 @@ impl Worker {
         let fault = match error {
             StoreError::Blob(error) => error.fault(),
             StoreError::Queue(error) if error.is_of_the_machine() => Fault::Machine,
+            // A worker of a newer version may know them.
+            StoreError::Options(_) => return Outcome::Failed(failure("store", error, true)),
             _ => return Outcome::Failed(failure("store", error, false)),
         };
         self.store_failed(fault, 0, error).await

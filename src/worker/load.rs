@@ -59,7 +59,7 @@ impl Worker {
         let target = StoredCloud::from_bytes(&target)?;
         options.dt_s = options
             .dt_s
-            .or_else(|| source.time?.interval_s(target.time?));
+            .or_else(|| Some(source.time?.interval_s(target.time?)?.abs()));
         let points = source.points.len().max(target.points.len());
         let (snapshots, kept) = mpsc::channel(1);
         let deadline = job.deadline.map(|deadline| {

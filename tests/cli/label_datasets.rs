@@ -220,6 +220,13 @@ fn the_challenges_of_argoverse_2_get_their_layouts() {
         copy(&data.join(&name), &log.join("sensors/lidar").join(&name));
     }
     let poses = "city_SE3_egovehicle.feather";
+    // Poses that cannot be read matter only where they are asked for.
+    fs::write(log.join(poses), "no table").expect("writable");
+    label(folder, &["av2:av2", "-o", "estimated"]);
+    let known = ["label", "av2:av2", "-o", "known", "--known-poses"];
+    let refused = fnsf(folder, &known);
+    assert_eq!(refused.code, 2, "{}", refused.stderr);
+    assert!(refused.stderr.contains(poses), "{}", refused.stderr);
     copy(&data.join(poses), &log.join(poses));
     let truth = fs::read(data.join("flow_labels.feather")).expect("there");
     let truth = read_av2_labels(&truth).expect("labels");

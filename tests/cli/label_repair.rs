@@ -84,6 +84,34 @@ fn a_repair_that_is_interrupted_is_done_by_the_next_run() {
 }
 
 #[test]
+fn flows_without_the_tracks_of_their_drive_are_missing_though_they_were_refused_once() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    drives(folder, 1, "3");
+    let run = |output: &str, more: &[&str]| {
+        let tracked = ["drives", "-o", output, "--tracks", "--preset", "default"];
+        label(folder, &[&tracked[..], more].concat())
+    };
+    assert_eq!(run("reference", &[]).code, 0);
+    let sweep = folder.join("drives/d0/sweep_0001.pcd");
+    let sound = fs::read(&sweep).expect("written");
+    fs::write(&sweep, &sound[..sound.len() / 2]).expect("writable");
+    assert_eq!(run("labels", &[]).code, 65);
+    assert_eq!(run("labels", &["--finalize"]).code, 0, "both are refused");
+    // What a repair leaves that is killed before it writes the tracks.
+    fs::write(&sweep, &sound).expect("writable");
+    fs::remove_file(folder.join("labels/d0/tracks.json")).expect("there");
+    for name in ["d0/sweep_0000.npz", "d0/sweep_0001.npz"] {
+        let [from, to] = ["reference", "labels"].map(|output| folder.join(output).join(name));
+        fs::copy(from, to).expect("copied");
+    }
+    assert_eq!(run("labels", &["--finalize"]).code, 75, "both are missing");
+    assert_eq!(run("labels", &[]).code, 0);
+    let [reference, found] = ["reference", "labels"].map(|name| labels(&folder.join(name)));
+    assert_same(&found, &reference);
+}
+
+#[test]
 fn a_store_that_fails_for_a_while_changes_no_tracks_and_no_flows() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();

@@ -368,6 +368,28 @@ fn rolling_sweeps_are_deskewed_and_their_flow_starts_from_the_deskewed_points() 
 }
 
 #[test]
+fn a_pair_with_the_newer_sweep_first_is_deskewed_against_the_direction_of_time() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    let arguments = ["synth", "-o", "street", "--rolling", "--speed-mps", "25"];
+    assert_eq!(fnsf(folder, &arguments).code, 0);
+    let [earlier, later] = ["1700000000000.pcd", "1700000000100.pcd"];
+    for (sweep, name) in [
+        ("street/sweep_0000.pcd", earlier),
+        ("street/sweep_0001.pcd", later),
+    ] {
+        std::fs::copy(folder.join(sweep), folder.join(name)).expect("copied");
+    }
+    let report = json(folder, &["flow", later, earlier, "--json"]);
+    assert_eq!(report["dt_s"], 0.1, "{report}");
+    assert_eq!(report["deskew"]["applied"], true, "{report}");
+    // Without timestamps in the names the first sweep counts as the earlier one.
+    let unnamed = ["street/sweep_0001.pcd", "street/sweep_0000.pcd"];
+    let report = json(folder, &["flow", unnamed[0], unnamed[1], "--json"]);
+    assert_eq!(report["deskew"]["applied"], false, "{report}");
+}
+
+#[test]
 fn deskewing_is_refused_where_it_is_asked_for_and_cannot_be_done() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();

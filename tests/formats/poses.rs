@@ -128,6 +128,9 @@ fn argoverse_poses_are_found_by_time_stamp() {
     let found = read_poses(&file, &sweeps).unwrap();
     assert!(difference(&found[0], &pose(12)) < SINGLE);
     assert!(difference(&found[1], &pose(3)) < SINGLE);
+    // As ROS writes times.
+    let found = read_poses(&file, &["scan_0315966265.259845000.pcd"]).unwrap();
+    assert!(difference(&found[0], &pose(9)) < SINGLE);
     let told = refusal(&file, &["315966265259800000.feather"]);
     assert!(
         told.contains("lacks a pose at the time of 315966265259800000.feather"),

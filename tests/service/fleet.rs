@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use reqwest::StatusCode;
 use serde_json::Value;
 
-use crate::clouds::{form, small_pair};
+use crate::clouds::{ENDLESS, form, small_pair};
 use crate::crash_recovery::{Dice, end_undisturbed, list_all, options};
 use crate::object_server::ObjectServer;
 use crate::postgres_server::{PostgresServer, start_postgres};
@@ -231,6 +231,25 @@ async fn nodes_know_each_other_and_a_node_without_devices_has_its_jobs_done_by_t
     assert!(number(&api) > 0.5 && number(&worker) < 0.5);
     worker.kill();
     api.until("it knows of its end", || nodes(&api) == [(true, 0)]);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_node_that_stops_answers_the_calls_whose_jobs_other_nodes_do() {
+    let Some(farm) = Farm::start("") else { return };
+    let (api, worker) = (farm.node("api"), farm.node("worker"));
+    let mut options: Value = serde_json::from_str(ENDLESS).expect("JSON");
+    options["deadline_ms"] = 4000.into();
+    let call = reqwest::Client::new()
+        .post(api.url("/v1/flow"))
+        .multipart(form(small_pair(), &options.to_string()))
+        .send();
+    let call = tokio::spawn(call);
+    worker.until("it does the job", || {
+        worker.metric("fnsf_jobs_running") > 0.5
+    });
+    api.signal("TERM");
+    let answer = call.await.expect("no panic").expect("an answer");
+    assert_eq!(answer.status(), StatusCode::OK, "{:?}", answer.text().await);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

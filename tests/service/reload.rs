@@ -75,7 +75,9 @@ async fn streams_of_events_end_with_the_key_of_their_reader() {
     let mut watch = watch.expect("news").into_inner();
 
     let file = folder.path().join("fnsf.toml");
-    reload(&server, &file, &config(&[NEW]), "are read again");
+    // The other key gets other rights, which ends no stream.
+    let changed = config(&[NEW]) + "max_priority = \"low\"\n";
+    reload(&server, &file, &changed, "are read again");
     while let Some(event) = old.next().await {
         event.expect("the stream ends as a whole");
     }

@@ -44,6 +44,11 @@ impl Folder {
     }
 }
 
+/// Names the cryptography of all clients of this process, which reqwest leaves to the program.
+pub(crate) fn name_cryptography() {
+    let _is_named = rustls::crypto::ring::default_provider().install_default();
+}
+
 impl Server {
     /// A new server with the default configuration and these additional arguments.
     pub(crate) fn start(arguments: &[&str]) -> Self {
@@ -106,8 +111,7 @@ impl Server {
         config: &str,
         arguments: &[&str],
     ) -> Self {
-        // The clients of the tests need one.
-        let _is_named = rustls::crypto::ring::default_provider().install_default();
+        name_cryptography();
         let file: PathBuf = folder.path().join("fnsf.toml");
         std::fs::write(&file, config).expect("a file");
         let mut child = program

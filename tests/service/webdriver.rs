@@ -2,6 +2,8 @@
 
 use serde_json::{Value, json};
 
+use crate::server::name_cryptography;
+
 /// The protocol's key of an element's identity.
 const ELEMENT: &str = "element-6066-11e4-a52e-4f735466cecf";
 
@@ -34,6 +36,7 @@ pub(crate) struct Session {
 impl Session {
     /// Opens a browser by the driver at `driver`.
     pub(crate) async fn open(driver: &str, capabilities: &Value) -> Result<Self, Refusal> {
+        name_cryptography();
         let new = Self {
             http: reqwest::Client::new(),
             url: format!("{driver}/session"),

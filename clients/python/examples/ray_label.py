@@ -15,5 +15,7 @@ import fnsf.bulk
 table, output = sys.argv[1:]
 pairs = ray.data.read_parquet(table).repartition(200)
 report = fnsf.bulk.ray_label(pairs, output, preset="default", num_cpus=2, concurrency=(1, 100))
+# Else each use of the report would label the pairs again.
+report = report.materialize()
 report.write_parquet(f"{output}-report")
 print(report.groupby("outcome").count().to_pandas())

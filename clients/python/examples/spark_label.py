@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Labels the pairs of a Parquet table on Spark.
 
-    spark-submit --conf spark.task.cpus=2 spark_label.py s3a://lake/pairs.parquet s3://lake/flow/run-7
+    spark-submit --conf spark.task.cpus=2 spark_label.py s3a://lake/pairs.parquet s3a://lake/flow/run-7
 
 The table has the columns key, source and target. A run that was cut off goes on when it is started again.
 """

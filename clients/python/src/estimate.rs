@@ -183,8 +183,9 @@ pub(crate) fn clock_of(points: &[Point], times: &[f32]) -> SweepClock {
     }
 }
 
-/// Seconds between two sweeps by their names and, where points have times, by their duration and the
-/// time on the sensor's clock; none where nothing is known.
+/// Seconds from one sweep to another by their names and, where points have times, by their duration
+/// and the time on the sensor's clock. Below zero where the other was measured first; none where
+/// nothing is known.
 #[pyfunction]
 pub(crate) fn pair_interval(
     names: [String; 2],

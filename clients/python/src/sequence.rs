@@ -32,6 +32,8 @@ struct State {
     tracker: Option<Tracker>,
     /// Whether estimates were lost by an exception after they were made.
     is_cut: bool,
+    /// The process that began it.
+    process: u32,
 }
 
 /// The estimates of the consecutive pairs of a sequence.
@@ -42,6 +44,9 @@ impl Sequence {
     /// The state. One thread at a time may push.
     fn state(&self) -> PyResult<MutexGuard<'_, State>> {
         match self.0.try_lock() {
+            Ok(state) if state.process != std::process::id() => Err(Error::new_err(
+                "this sequence was begun before a fork, and its threads are in the other process: begin another one",
+            )),
             Ok(state) if state.is_cut => Err(Error::new_err(
                 "an exception ended this sequence: flows that were found by then are lost; begin another one",
             )),
@@ -117,6 +122,7 @@ impl Sequence {
             last: None,
             tracker: track.then(Tracker::default),
             is_cut: false,
+            process: std::process::id(),
         })))
     }
 

@@ -1,5 +1,6 @@
 """The client against a server over real sockets."""
 
+import pickle
 import threading
 import time
 from datetime import datetime, timezone
@@ -45,6 +46,12 @@ def test_refusals_have_the_code_of_the_server(server, pair):
     with fnsf.Client("127.0.0.1:1") as client, pytest.raises(ServerError) as refused:
         client.flow(pair.source, pair.target)
     assert refused.value.code is None and refused.value.status == "UNAVAILABLE"
+
+
+def test_a_refusal_goes_from_one_process_to_another():
+    refused = pickle.loads(pickle.dumps(ServerError("server_full", "UNAVAILABLE", "full", 2.0)))
+    assert (refused.code, refused.status, refused.retry_after) == ("server_full", "UNAVAILABLE", 2.0)
+    assert str(refused) == "server_full [UNAVAILABLE]: full (try again in 2 s)"
 
 
 def test_a_deadline_of_the_call_gives_the_best_flow_so_far(server, pair):

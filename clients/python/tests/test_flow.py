@@ -67,6 +67,13 @@ def test_every_kind_of_numbers_is_taken(pair, kind):
     assert same(fnsf.flow(*given, force=True), wanted)
 
 
+def test_arrays_that_begin_between_two_words_are_taken(pair):
+    wanted = fnsf.flow(pair.source, pair.target)
+    record = b"x" + pair.source.astype("<f4").tobytes()
+    found = fnsf.flow(np.frombuffer(record, "<f4", offset=1).reshape(-1, 3), pair.target)
+    assert np.array_equal(found.flow, wanted.flow)
+
+
 def test_masks_times_and_ego_motions_are_taken(street, pair):
     masked = fnsf.flow(pair.source, pair.target, ground=pair.masks, ego=pair.ego)
     assert np.allclose(masked.ego, pair.ego)

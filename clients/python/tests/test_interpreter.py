@@ -107,6 +107,27 @@ print(np.array_equal(fnsf.flow(pair.source, pair.target).flow, wanted.flow))
     assert said.split() == ["0", "0", "0", "True"]
 
 
+def test_a_sequence_that_was_begun_before_a_fork_says_so_in_the_child(python):
+    said = python(
+        """
+import os, warnings, fnsf
+warnings.simplefilter("ignore", DeprecationWarning)
+street = fnsf.simulate(beams=16, azimuth_steps=500)
+sequence = fnsf.Sequence()
+sequence.push(street.sweep(0).points)
+child = os.fork()
+if child == 0:
+    try:
+        sequence.push(street.sweep(1).points)
+    except fnsf.Error as error:
+        os._exit(0 if "before a fork" in str(error) else 2)
+    os._exit(1)
+print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), len(sequence.push(street.sweep(1).points)))
+"""
+    )
+    assert said.split() == ["0", "1"]
+
+
 def test_a_child_forked_after_use_of_a_gpu_says_that_it_cannot(python):
     said = python(
         """

@@ -231,7 +231,8 @@ impl Body {
         let most = self.service.admission.limits().max_points;
         let mut room = self.room.another();
         self.timed(move || {
-            room.hold(codec::unfolded_bytes(PART, &bytes, None, most)?)?;
+            // Pairs are decoded piece by piece.
+            room.hold(codec::decoding_memory(PART, &bytes, None, most)?.clouds)?;
             Ok((codec::read_pair(PART, &bytes, most)?, room))
         })
         .await

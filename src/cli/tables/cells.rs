@@ -1,11 +1,13 @@
 //! The ablation of the distance transform's cells.
 
+use std::fmt;
+
 use serde::Serialize;
 
 use super::devices::Devices;
 use super::measure::{Budget, Subject, measure};
 use crate::cli::failure::Failure;
-use crate::cli::output::say;
+use crate::cli::output::tell;
 use crate::cli::terminal::Terminal;
 use crate::flow::Options;
 use crate::job::{FieldChoices, JobOptions, PresetChoice};
@@ -46,6 +48,8 @@ pub(super) struct Ablation<'a> {
     /// Adds what the pair and the command line decide.
     pub(super) complete: &'a dyn Fn(&JobOptions) -> Options,
     pub(super) terminal: &'a Terminal,
+    /// Whether the tables are written to files too.
+    pub(super) writes: bool,
 }
 
 impl Ablation<'_> {
@@ -55,6 +59,7 @@ impl Ablation<'_> {
         let name = &subject.name;
         let mode = if self.bev { ", bird's eye view" } else { "" };
         self.terminal.finish();
+        let say = |line: fmt::Arguments<'_>| tell(self.writes, line);
         say(format_args!(
             "\nCells of the distance transform, fnsf{mode}\n"
         ))?;

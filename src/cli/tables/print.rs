@@ -5,7 +5,7 @@ use std::io::{self, Write};
 
 use super::figures::Figures;
 use crate::cli::failure::Failure;
-use crate::cli::output::say;
+use crate::cli::output::tell;
 
 /// A number with `digits` digits after the point, or a dash.
 fn number(value: Option<f64>, digits: usize) -> String {
@@ -63,19 +63,19 @@ fn cells(figures: &Figures) -> [String; 17] {
     ]
 }
 
-/// Prints the heading of a table.
-pub(super) fn heading() -> Result<(), Failure> {
-    say(format_args!("| {} |", HEADING.join(" | ")))?;
+/// Prints the heading of a table; see [`tell`].
+pub(super) fn heading(writes: bool) -> Result<(), Failure> {
+    tell(writes, format_args!("| {} |", HEADING.join(" | ")))?;
     let mut line = String::from("|");
     for _ in HEADING {
         let _ = write!(line, "---|");
     }
-    say(format_args!("{line}"))
+    tell(writes, format_args!("{line}"))
 }
 
-/// Prints one row of a table.
-pub(super) fn row(figures: &Figures) -> Result<(), Failure> {
-    say(format_args!("| {} |", cells(figures).join(" | ")))
+/// Prints one row of a table; see [`tell`].
+pub(super) fn row(writes: bool, figures: &Figures) -> Result<(), Failure> {
+    tell(writes, format_args!("| {} |", cells(figures).join(" | ")))
 }
 
 /// Writes all figures as CSV, with a heading. Units are those of the JSON output.

@@ -15,7 +15,7 @@ use super::{plots, print};
 use crate::cli::device::DeviceArgument;
 use crate::cli::failure::Failure;
 use crate::cli::files;
-use crate::cli::output::say;
+use crate::cli::output::{say, tell};
 use crate::cli::terminal::Terminal;
 use crate::flow::{Ego, Options};
 use crate::formats::Pair;
@@ -136,11 +136,18 @@ impl Tables {
                     budget: self.budget,
                     complete: &|options| self.complete(options, &subject.pair, 0),
                     terminal: &terminal,
+                    writes: self.writes(),
                 };
                 cells.extend(ablation.run(&subject)?);
             }
         }
         self.write(&methods, &cells)
+    }
+
+    /// Whether the tables are written to files too.
+    fn writes(&self) -> bool {
+        let files = [&self.csv, &self.json, &self.plots];
+        files.into_iter().any(Option::is_some)
     }
 
     /// Runs the methods on one pair and prints each row when it is known.
@@ -153,8 +160,8 @@ impl Tables {
         let Subject { name, pair, .. } = subject;
         let mut all = Vec::new();
         terminal.finish();
-        say(format_args!("\n{name}\n"))?;
-        print::heading()?;
+        tell(self.writes(), format_args!("\n{name}\n"))?;
+        print::heading(self.writes())?;
         let chosen = |row: &Row| self.only.is_empty() || self.only.contains(&row.name);
         for row in ALL.into_iter().filter(chosen) {
             let mut runs = Vec::new();
@@ -173,7 +180,7 @@ impl Tables {
             }
             let figures = Figures::new(name, &row, &runs);
             terminal.finish();
-            print::row(&figures)?;
+            print::row(self.writes(), &figures)?;
             all.push(figures);
         }
         Ok(all)

@@ -13,7 +13,7 @@ use super::nearest::{BruteForce, KdTrees};
 use super::tile::WorkingSets;
 use super::trainer::CpuTrainer;
 use crate::flow::data::{Control, Point, Random, Uncontrolled};
-use crate::flow::distance::DistanceTransform;
+use crate::flow::distance::{DistanceOptions, DistanceTransform};
 use crate::flow::field::{
     Backend, BackendError, ChamferLoss, Conditioning, ConsistencyLoss, CycleLoss, DistanceLoss,
     LinearGrid, Loss, NearestSearcher, Network, OTHER_LOSS, Parameters, PreparedTarget, Schedule,
@@ -109,6 +109,8 @@ impl Backend for CpuBackend {
                 Ok(Box::new(TransformTarget {
                     fits,
                     distance: Arc::new(distance),
+                    transform: transform.clone(),
+                    to_source: None,
                 }))
             }
             LossOptions::Chamfer(options) => {
@@ -221,10 +223,17 @@ impl Fits {
     }
 }
 
+/// The error of a fit with a cycle to a target that was prepared without one.
+const NO_CYCLE: BackendError = BackendError::Unsupported("the target was prepared for no cycle");
+
 /// A target's distance transform.
 struct TransformTarget {
     fits: Fits,
     distance: Arc<DistanceTransform>,
+    /// The options of the transform.
+    transform: DistanceOptions,
+    /// The source's distance transform, for a cycle.
+    to_source: Option<Arc<DistanceTransform>>,
 }
 
 impl PreparedTarget for TransformTarget {
@@ -236,6 +245,16 @@ impl PreparedTarget for TransformTarget {
         let sample = |&point: &Point| self.distance.sample(point).distance;
         let sampled = || points.par_iter().map(sample).collect();
         Ok(self.fits.threads.install(sampled))
+    }
+
+    fn prepare_cycle(
+        &mut self,
+        source: &[Point],
+        control: &dyn Control,
+    ) -> Result<(), BackendError> {
+        let build = || DistanceTransform::build(source, source, &self.transform, control);
+        self.to_source = Some(Arc::new(self.fits.threads.install(build)?));
+        Ok(())
     }
 
     fn start(
@@ -250,9 +269,8 @@ impl PreparedTarget for TransformTarget {
             distance,
         };
         let to_source = || {
-            let transform = &loss_options.transform;
-            let build = || DistanceTransform::build(source, source, transform, &Uncontrolled);
-            Ok(loss(Arc::new(self.fits.threads.install(build)?)))
+            let distance = self.to_source.clone().ok_or(NO_CYCLE)?;
+            Ok(loss(distance))
         };
         let to_target = loss(Arc::clone(&self.distance));
         self.fits.start(to_target, to_source, source, options, seed)

@@ -42,9 +42,8 @@ pub(super) fn residual_motion(
         Some(ego) => aligned_neighbors(host, input, ego)?,
     };
     let precomputed_at = control.seconds();
-    let share = |times: &[f32]| -> Vec<f32> {
-        times.iter().map(|time| time / input.options.dt_s).collect()
-    };
+    let elapsed_s = input.options.elapsed_s();
+    let share = |times: &[f32]| -> Vec<f32> { times.iter().map(|time| time / elapsed_s).collect() };
     let shares = problem
         .times
         .filter(|_| input.is_deskewed)
@@ -79,7 +78,7 @@ pub(super) fn residual_motion(
             points: &selection.target,
             times: &at(&selection.target_rows, target_times),
         };
-        search.scale_to_interval(source, target, input.options.dt_s);
+        search.scale_to_interval(source, target, elapsed_s);
     }
     let mut objects = host.threads().install(|| {
         let (rows, source) = (&selection.rows, &selection.source);

@@ -93,7 +93,7 @@ pub(super) fn deskew(
     }
     let move_back = |points: &[Point], times: &[f32]| {
         host.threads()
-            .install(|| deskewed(points, times, motion, options.dt_s))
+            .install(|| deskewed(points, times, motion, options.elapsed_s()))
     };
     let moved = [0, 1].map(|sweep| move_back(given[sweep], times[sweep]));
     let fine = align([&moved[0], &moved[1]], motion);

@@ -103,6 +103,21 @@ pub trait PreparedTarget: Send {
     /// [`BackendError::Device`] if a GPU has no memory for the points or fails. A CPU never fails.
     fn distances(&self, points: &[Point]) -> Result<Vec<f32>, BackendError>;
 
+    /// Prepares the way back of a cycle, from the target to `source` (N x 3, metres): builds the
+    /// distance transform of the source, with the cells of the target's. A fit with the cycle of NSFP
+    /// to a distance transform needs it before [`Self::start`]. Checks `control` before each part.
+    ///
+    /// # Errors
+    /// As [`Backend::prepare_target`].
+    fn prepare_cycle(
+        &mut self,
+        source: &[Point],
+        control: &dyn Control,
+    ) -> Result<(), BackendError> {
+        let _nothing_is_needed = (source, control);
+        Ok(())
+    }
+
     /// Starts a fit of a field to `source` (N x 3, metres) and returns it before its first
     /// iteration. `source` must have at least one point, which is not checked. It must have at most
     /// as many points as the source that the target was prepared with; only a GPU refuses more. The
@@ -110,8 +125,8 @@ pub trait PreparedTarget: Send {
     /// the truncation and the penalty. `seed` determines the initial parameters and the batches.
     ///
     /// # Errors
-    /// - [`BackendError::Unsupported`] if the target was prepared for another kind of loss, or the
-    ///   device lacks the precision of `options`. A CPU has only single precision. Half precision
+    /// - [`BackendError::Unsupported`] if the target was prepared for another kind of loss or for no
+    ///   cycle, or the device lacks the precision of `options`. A CPU has only single precision. Half precision
     ///   needs a GPU whose matrix units pass their self-test. A GPU also lacks what
     ///   [`FieldOptions::runs_on_gpu`] excludes.
     /// - [`BackendError::Linear`] if an option of the linear model is out of range, or its grid needs

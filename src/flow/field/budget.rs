@@ -82,7 +82,13 @@ pub(crate) fn prepare_target(
         if let Some(loss) = loss.distance_mut() {
             loss.transform.set_cell(loss.transform.cell_m * coarser);
         }
-        match backend.prepare_target(source, target, &loss, control) {
+        let mut prepared = backend.prepare_target(source, target, &loss, control);
+        if let (Ok(target), true) = (&mut prepared, options.has_cycle())
+            && let Err(error) = target.prepare_cycle(source, control)
+        {
+            prepared = Err(error);
+        }
+        match prepared {
             Ok(target) => Ok(Some(target)),
             Err(BackendError::Interrupted(Interrupt::Deadline)) => Ok(None),
             Err(BackendError::Interrupted(Interrupt::Cancelled)) => Err(FitError::Cancelled),

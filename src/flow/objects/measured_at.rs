@@ -26,13 +26,13 @@ pub(crate) struct TimedPoints<'a> {
 }
 
 impl ObjectSearch {
-    /// Scales the motion of each object from its real time to `dt_s`, the time between the two
-    /// sweeps in seconds. `source` has the N points of the search.
+    /// Scales the motion of each object from its real time to `elapsed_s`, the time of the target
+    /// less that of the source in seconds. `source` has the N points of the search.
     pub(crate) fn scale_to_interval(
         &mut self,
         source: TimedPoints<'_>,
         target: TimedPoints<'_>,
-        dt_s: f32,
+        elapsed_s: f32,
     ) {
         let mut rows: Vec<Vec<u32>> = vec![Vec::new(); self.motions.count()];
         for (row, &cluster) in self.parts.of.iter().enumerate() {
@@ -56,7 +56,7 @@ impl ObjectSearch {
                 .filter_map(later)
                 .collect();
             let mean = later.iter().sum::<f32>() / later.len().max(1) as f32;
-            let intervals = 1.0 + mean / dt_s;
+            let intervals = 1.0 + mean / elapsed_s;
             let [least, most] = PLAUSIBLE;
             if (least..=most).contains(&intervals) {
                 self.motions.scale(motion as u32, 1.0 / intervals);
@@ -74,8 +74,8 @@ mod tests {
     use crate::flow::objects::search::SearchSeconds;
 
     /// The x of a motion of 1 m after scaling, where the target's points were measured `later`
-    /// seconds after the source's.
-    fn scaled(later: f32) -> f32 {
+    /// seconds after the source's, and the sweeps are `elapsed_s` apart.
+    fn scaled_in(elapsed_s: f32, later: f32) -> f32 {
         let source: Vec<Point> = (0..20)
             .map(|i| [10.0, f32::from(i as u8) * 0.1, 0.0])
             .collect();
@@ -103,8 +103,12 @@ mod tests {
             points: &target,
             times: &[0.05 + later; 20],
         };
-        search.scale_to_interval(from, to, 0.1);
+        search.scale_to_interval(from, to, elapsed_s);
         search.motions.displacement(0, source[0])[0]
+    }
+
+    fn scaled(later: f32) -> f32 {
+        scaled_in(0.1, later)
     }
 
     #[test]
@@ -112,6 +116,9 @@ mod tests {
         for (later, expected) in [(0.0, 1.0), (0.025, 0.8), (-0.02, 1.25)] {
             let found = scaled(later);
             assert!((found - expected).abs() < 1e-5, "{later}: {found}");
+            // The same points, from the later sweep to the earlier one.
+            let back = scaled_in(-0.1, -later);
+            assert!((back - expected).abs() < 1e-5, "{later}: {back}");
         }
     }
 

@@ -35,6 +35,8 @@ pub struct Options {
     /// cluster is its displacement divided by this time, and its yaw rate is its rotation divided
     /// by it.
     pub dt_s: f32,
+    /// Whether the source was measured after the target. It matters to the times of points alone.
+    pub newest_first: bool,
     /// Handling of ground points.
     pub ground: Ground,
     /// Handling of the ego motion.
@@ -66,6 +68,15 @@ impl Options {
         match &self.method {
             Method::Objects(objects) if self.ego != Ego::Off => objects.sweeps.max(2),
             Method::Objects(_) | Method::Field(_) => 2,
+        }
+    }
+
+    /// The time of the target less that of the source, seconds: [`Self::dt_s`], or its negative.
+    pub(crate) fn elapsed_s(&self) -> f32 {
+        if self.newest_first {
+            -self.dt_s
+        } else {
+            self.dt_s
         }
     }
 

@@ -142,6 +142,7 @@ impl Preset {
             min_range_m: None,
             force: false,
             dt_s: DEFAULT_DT_S,
+            newest_first: false,
             ground,
             ego,
             always_deskew: false,

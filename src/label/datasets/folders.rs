@@ -89,6 +89,7 @@ async fn drive(place: &Place, folder: &str, files: &[String]) -> Result<Drive, D
             time_s: None,
         })
         .collect();
+    let mut bad_poses = None;
     if let Some(log) = folder.strip_suffix(AV2_SWEEPS) {
         let file = format!("{log}city_SE3_egovehicle.feather");
         match place.read(&file).await {
@@ -96,12 +97,13 @@ async fn drive(place: &Place, folder: &str, files: &[String]) -> Result<Drive, D
             Err(error) => return Err(error.into()),
             Ok(bytes) => {
                 let names: Vec<&str> = files.iter().map(String::as_str).collect();
-                let poses = read_poses(&bytes, &names).map_err(|error| DatasetError::Table {
-                    file: place.uri(&file),
-                    what: error.to_string(),
-                })?;
-                for (sweep, pose) in sweeps.iter_mut().zip(poses) {
-                    sweep.pose = Some(pose);
+                match read_poses(&bytes, &names) {
+                    Ok(poses) => {
+                        for (sweep, pose) in sweeps.iter_mut().zip(poses) {
+                            sweep.pose = Some(pose);
+                        }
+                    }
+                    Err(error) => bad_poses = Some(format!("{}: {error}", place.uri(&file))),
                 }
             }
         }
@@ -109,6 +111,7 @@ async fn drive(place: &Place, folder: &str, files: &[String]) -> Result<Drive, D
     Ok(Drive {
         name: name(folder),
         sweeps,
+        bad_poses,
     })
 }
 

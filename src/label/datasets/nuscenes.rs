@@ -59,9 +59,9 @@ pub(super) async fn drives(place: &Place) -> Result<Vec<Drive>, DatasetError> {
         pose: Some(sweep.world_from_sensor),
         time_s: Some(sweep.timestamp_us as f64 * 1e-6),
     };
-    let drive = |scene: NuscenesScene| Drive {
-        name: key_of(&scene.name),
-        sweeps: scene.sweeps.into_iter().map(sweep).collect(),
+    let drive = |scene: NuscenesScene| {
+        let sweeps = scene.sweeps.into_iter().map(sweep);
+        Drive::new(key_of(&scene.name), sweeps.collect())
     };
     let mut drives: Vec<Drive> = scenes.into_iter().map(drive).collect();
     drives.sort_by(|one, other| one.name.cmp(&other.name));

@@ -112,10 +112,7 @@ fn sweeps(table: &Table, folder: Option<&str>) -> Result<Vec<Drive>, ManifestErr
         let pose = values.get("pose").map(|text| pose(text).map_err(&wrong));
         let name = drive_name(values.get("drive").map_or("", String::as_str));
         let place = *places.entry(name.clone()).or_insert_with(|| {
-            drives.push(Drive {
-                name,
-                sweeps: Vec::new(),
-            });
+            drives.push(Drive::new(name, Vec::new()));
             drives.len() - 1
         });
         drives[place].sweeps.push(DriveSweep {
@@ -146,10 +143,10 @@ fn pairs(table: &Table, folder: Option<&str>) -> Result<Vec<Drive>, ManifestErro
         let id = values
             .get("id")
             .map_or_else(|| stem(source), String::as_str);
-        Ok(Drive {
-            name: drive_name(values.get("drive").map_or("", String::as_str)),
-            sweeps: vec![sweep(source, id), sweep(target, stem(target))],
-        })
+        Ok(Drive::new(
+            drive_name(values.get("drive").map_or("", String::as_str)),
+            vec![sweep(source, id), sweep(target, stem(target))],
+        ))
     };
     table.rows.iter().enumerate().map(pair).collect()
 }

@@ -34,7 +34,7 @@ def points(name: str, value: Any) -> Points:
     array = _array(name, value, "fiu", "numbers")
     if array.ndim != 2 or array.shape[1] < 3:
         raise InputError(f"{name} has shape {array.shape}: N x 3 is needed")
-    return np.ascontiguousarray(array[:, :3], dtype=np.float32)
+    return np.require(array[:, :3], dtype=np.float32, requirements=["C", "A"])
 
 
 def mask(name: str, value: Any) -> Mask:
@@ -42,7 +42,7 @@ def mask(name: str, value: Any) -> Mask:
     array = _array(name, value, "bfiu", "flags")
     if array.ndim != 1:
         raise InputError(f"{name} has shape {array.shape}: one flag a point is needed")
-    return np.ascontiguousarray(array, dtype=np.bool_)
+    return np.require(array, dtype=np.bool_, requirements=["C", "A"])
 
 
 def values(name: str, value: Any) -> Values:
@@ -50,7 +50,7 @@ def values(name: str, value: Any) -> Values:
     array = _array(name, value, "fiu", "numbers")
     if array.ndim != 1:
         raise InputError(f"{name} has shape {array.shape}: one number a point is needed")
-    return np.ascontiguousarray(array, dtype=np.float32)
+    return np.require(array, dtype=np.float32, requirements=["C", "A"])
 
 
 def matrix(name: str, value: Any) -> Matrix:
@@ -58,4 +58,4 @@ def matrix(name: str, value: Any) -> Matrix:
     array = _array(name, value, "fiu", "numbers")
     if array.shape != (4, 4):
         raise InputError(f"{name} has shape {array.shape}: 4 x 4 is needed")
-    return np.ascontiguousarray(array, dtype=np.float64)
+    return np.require(array, dtype=np.float64, requirements=["C", "A"])

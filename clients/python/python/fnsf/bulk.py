@@ -65,7 +65,7 @@ class Labeller:
         if ending not in ENDINGS:
             raise _native.InputError(f"labels are {', '.join(ENDINGS)}, not {ending}")
         check(**options)
-        self._output, self._ending, self._options = output.rstrip("/"), ending, options
+        self._output, self._ending, self._options = output.rstrip("/") or "/", ending, options
 
     def __call__(self, batch: Mapping[str, Any]) -> dict[str, Any]:
         """Labels the rows of a batch: columns key, source and target. Returns the columns of the report."""
@@ -85,17 +85,20 @@ class Labeller:
         try:
             # The key is a name, not a part of a URI: `%2e` is no dot.
             filesystem, root = _filesystem(self._output)
-            path = f"{root}/{key}.{self._ending}"
+            path = f"{root.rstrip('/')}/{key}.{self._ending}"
             if _exists(filesystem, path):
                 return report | {"outcome": "found"}
             first, second = _sweep(source), _sweep(target)
+            apart = _native.pair_interval((source, target), (_clock(first), _clock(second)))
             times = None
             if first.times is not None and second.times is not None:
                 times = (first.times, second.times)
+                if apart is not None and apart < 0.0:
+                    # The flow leads back in time: so do the times of the points.
+                    times = (-first.times, -second.times)
             options = self._options
-            if options.get("dt_s") is None:
-                clocks = (_clock(first), _clock(second))
-                options = options | {"dt_s": _native.pair_interval((source, target), clocks)}
+            if options.get("dt_s") is None and apart is not None:
+                options = options | {"dt_s": abs(apart)}
             found = flow(first.points, second.points, times=times, **options)
             written = _put_new(filesystem, path, found.to_bytes(self._ending))
         except REFUSED as error:
@@ -112,6 +115,8 @@ def _filesystem(uri: str) -> tuple[Any, str]:
     """The file system of a path or URI, and the path in it."""
     from pyarrow import fs
 
+    # Hadoop's name of the same stores.
+    uri = re.sub("^s3a://", "s3://", uri)
     scheme, separator, rest = uri.partition("://")
     if not separator:
         return fs.LocalFileSystem(), os.path.abspath(uri)

@@ -30,6 +30,8 @@ from ._native import Error
 T = TypeVar("T")
 ENDED = frozenset({"succeeded", "failed", "cancelled", "expired"})
 """The states of a job that has ended."""
+LATE = 10.0
+"""Seconds after a deadline within which its flow may arrive over a slow line."""
 RETRIED = ("GetJob", "ListJobs", "CancelJob", "GetTracks", "DownloadResult", "WatchJob")
 """The calls that gRPC itself repeats: they have no effect, or the same one."""
 
@@ -47,6 +49,10 @@ class ServerError(Error):
         again = "" if retry_after is None else f" (try again in {retry_after:g} s)"
         super().__init__(f"{code or 'no answer'} [{status}]: {message}{again}")
         self.code, self.status, self.retry_after = code, status, retry_after
+        self._message = message
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return ServerError, (self.code, self.status, self._message, self.retry_after)
 
 
 @dataclass(frozen=True)
@@ -173,7 +179,7 @@ class Client:
         server: `host:port`.
         api_key: the key, where the server has keys.
         tls: True for a certificate that this machine trusts, or the PEM bytes of the authority.
-        timeout: seconds for calls that answer at once; None for no limit.
+        timeout: seconds for calls that send and answer little; None for no limit.
     """
 
     def __init__(
@@ -184,7 +190,13 @@ class Client:
         tls: bool | bytes = False,
         timeout: float | None = 60.0,
     ) -> None:
-        settings = [("grpc.service_config", _service_config()), ("grpc.max_receive_message_length", 8 << 20)]
+        settings = [
+            ("grpc.service_config", _service_config()),
+            ("grpc.max_receive_message_length", 8 << 20),
+            # A server whose machine is gone says nothing.
+            ("grpc.keepalive_time_ms", 30_000),
+            ("grpc.keepalive_timeout_ms", 10_000),
+        ]
         if tls:
             trusted = grpc.ssl_channel_credentials(tls if isinstance(tls, bytes) else None)
             self._channel = grpc.secure_channel(server, trusted, settings)
@@ -250,6 +262,8 @@ class Client:
         if isinstance(ground, tuple):
             masks = [_arrays.mask(f"the ground mask of pc{place}", mask) for place, mask in enumerate(ground, 1)]
             ground = None
+        if deadline is not None:
+            options["deadline_ms"] = max(1, round(1000.0 * deadline))
         message = _protocol.options_message({"ground": ground, **options})
         request = _protocol.MESSAGES["EstimateFlowRequest"]
         begin = _protocol.nested("EstimateFlowRequest", "Begin")
@@ -263,7 +277,8 @@ class Client:
 
         header: Any = None
         pieces: list[Any] = []
-        for answer in self._stream("EstimateFlow", requests(), deadline):
+        limit = None if deadline is None else deadline + LATE
+        for answer in self._stream("EstimateFlow", requests(), limit):
             part = answer.WhichOneof("part")
             if part == "progress" and progress:
                 progress(answer.progress.done, answer.progress.total, answer.progress.loss)
@@ -350,7 +365,7 @@ class Client:
                 for chunk in _protocol.chunks(points, mask):
                     yield request(chunk=chunk)
 
-        return _job(_repeated(lambda: self._call("SubmitJob", requests()), retry_for))
+        return _job(_repeated(lambda: next(self._stream("SubmitJob", requests(), None)), retry_for))
 
     def job(self, id: str) -> Job:
         """A job."""

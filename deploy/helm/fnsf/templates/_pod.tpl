@@ -28,6 +28,7 @@ securityContext:
   runAsUser: 65532
   runAsGroup: 65532
   fsGroup: 65532
+  fsGroupChangePolicy: OnRootMismatch
   seccompProfile:
     type: RuntimeDefault
 terminationGracePeriodSeconds: {{ .Values.gracePeriodSeconds }}

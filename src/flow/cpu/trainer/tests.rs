@@ -279,6 +279,24 @@ fn a_target_for_one_kind_of_loss_refuses_a_fit_to_another() {
 }
 
 #[test]
+fn the_way_back_of_a_cycle_is_prepared_under_the_control() {
+    let [source, target] = clouds(1500);
+    let options = Preset::NsfpPlusPlusDt.field();
+    let mut target = prepared(Isa::available()[0], 2, &source, &target, &options);
+    let unprepared = target.start(&source, &options, 0).err();
+    assert!(matches!(unprepared, Some(BackendError::Unsupported(_))));
+    let interrupted = target.prepare_cycle(&source, &Impatient::default());
+    assert!(matches!(interrupted, Err(BackendError::Interrupted(_))));
+    assert!(target.start(&source, &options, 0).is_err());
+    target
+        .prepare_cycle(&source, &Uncontrolled)
+        .expect("a small cloud");
+    let mut trainer = target.start(&source, &options, 0).expect("a trainer");
+    let advance = trainer.advance(2, &Uncontrolled);
+    assert_eq!(advance.expect("the cpu does not fail"), Advance::Continues);
+}
+
+#[test]
 fn a_fit_with_growing_batches_and_rare_searches_resumes_with_the_same_bits() {
     let mut renewed = Preset::NsfpBaseline.field();
     let LossOptions::Chamfer(loss) = &mut renewed.loss else {
