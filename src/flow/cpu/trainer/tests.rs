@@ -61,9 +61,14 @@ fn prepared(
     options: &FieldOptions,
 ) -> Box<dyn PreparedTarget> {
     let backend = CpuBackend::with_isa(isa, Some(threads)).expect("threads");
-    backend
+    let mut prepared = backend
         .prepare_target(source, target, &options.loss, &Uncontrolled)
-        .expect("small clouds")
+        .expect("small clouds");
+    if options.has_cycle() {
+        let cycle = prepared.prepare_cycle(source, &Uncontrolled);
+        cycle.expect("a small cloud");
+    }
+    prepared
 }
 
 fn fitted(
@@ -282,7 +287,9 @@ fn a_target_for_one_kind_of_loss_refuses_a_fit_to_another() {
 fn the_way_back_of_a_cycle_is_prepared_under_the_control() {
     let [source, target] = clouds(1500);
     let options = Preset::NsfpPlusPlusDt.field();
-    let mut target = prepared(Isa::available()[0], 2, &source, &target, &options);
+    let backend = CpuBackend::new(Some(2)).expect("threads");
+    let target = backend.prepare_target(&source, &target, &options.loss, &Uncontrolled);
+    let mut target = target.expect("a small cloud");
     let unprepared = target.start(&source, &options, 0).err();
     assert!(matches!(unprepared, Some(BackendError::Unsupported(_))));
     let interrupted = target.prepare_cycle(&source, &Impatient::default());
