@@ -169,8 +169,8 @@ impl UploadReservation {
     /// Adds `bytes` received bytes to the reservation and to the time credit.
     ///
     /// # Errors
-    /// [`ApiError::TooLarge`] if the body exceeds its limit or the whole budget, [`ApiError::ServerFull`] if the budget
-    /// of all bodies or of the tenant is exhausted.
+    /// [`ApiError::TooLarge`] if the body exceeds its limit or the whole budget,
+    /// [`ApiError::ServerFull`] if the budget of all bodies or of the tenant is exhausted.
     pub(super) fn take(&mut self, bytes: usize) -> Result<(), ApiError> {
         let limits = self.uploads.limits;
         self.bytes += bytes as u64;
