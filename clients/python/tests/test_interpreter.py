@@ -113,7 +113,7 @@ def test_a_sequence_that_was_begun_before_a_fork_says_so_in_the_child(python):
 import os, warnings, fnsf
 warnings.simplefilter("ignore", DeprecationWarning)
 street = fnsf.simulate(beams=16, azimuth_steps=500)
-sequence = fnsf.Sequence()
+sequence = fnsf.Sequence(preset="default")
 sequence.push(street.sweep(0).points)
 child = os.fork()
 if child == 0:
