@@ -196,7 +196,7 @@ fn wrong_arguments_are_refused_with_exit_code_2_before_any_work() {
     }
 }
 
-/// Runs the program with a stdout that nobody reads.
+/// Runs the program. Its stdout is closed at once.
 fn without_reader(folder: &std::path::Path, arguments: &[&str]) -> std::process::Output {
     use std::process::{Command, Stdio};
     let mut child = Command::new(env!("CARGO_BIN_EXE_fnsf"))

@@ -5,6 +5,7 @@ use std::os::unix::net::UnixListener;
 use std::path::Path;
 
 use super::label::{assert_same, drives, label, labels};
+use super::program::Ended;
 
 /// A manifest of the sweeps of `drives/d0`, as `folder/drives.csv`.
 fn manifest(folder: &Path, name: &str, sweeps: usize, apart_s: f64) {
@@ -16,28 +17,29 @@ fn manifest(folder: &Path, name: &str, sweeps: usize, apart_s: f64) {
     fs::write(folder.join(name), text).expect("writable");
 }
 
+/// Labels the drives with tracks.
+fn tracked(folder: &Path, output: &str, more: &[&str]) -> Ended {
+    let run = ["drives", "-o", output, "--tracks", "--preset", "default"];
+    label(folder, &[&run[..], more].concat())
+}
+
 #[test]
 fn a_mended_sweep_gives_the_tracks_and_the_flows_of_a_drive_without_fault() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     drives(folder, 1, "8");
-    let tracked = |output: &str| {
-        label(
-            folder,
-            &["drives", "-o", output, "--tracks", "--preset", "default"],
-        )
-    };
-    assert_eq!(tracked("reference").code, 0);
+    let run = |output: &str| tracked(folder, output, &[]);
+    assert_eq!(run("reference").code, 0);
     let sweep = folder.join("drives/d0/sweep_0003.pcd");
     let bytes = fs::read(&sweep).expect("written");
     fs::write(&sweep, &bytes[..bytes.len() / 2]).expect("writable");
-    let refused = tracked("labels");
+    let refused = run("labels");
     assert_eq!(refused.code, 65, "{}", refused.stderr);
     let [reference, damaged] = ["reference", "labels"].map(|name| labels(&folder.join(name)));
     assert_eq!(damaged.len(), 7 + 1 - 2);
     assert!(damaged["d0/tracks.json"] != reference["d0/tracks.json"]);
     fs::write(&sweep, &bytes).expect("writable");
-    let mended = tracked("labels");
+    let mended = run("labels");
     assert_eq!(mended.code, 0, "{}", mended.stderr);
     assert_same(&labels(&folder.join("labels")), &reference);
 }
@@ -47,10 +49,7 @@ fn a_repair_that_is_interrupted_is_done_by_the_next_run() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     drives(folder, 1, "8");
-    let run = |output: &str, more: &[&str]| {
-        let tracked = ["drives", "-o", output, "--tracks", "--preset", "default"];
-        label(folder, &[&tracked[..], more].concat())
-    };
+    let run = |output: &str, more: &[&str]| tracked(folder, output, more);
     assert_eq!(run("reference", &[]).code, 0);
     let [damaged, away] =
         ["0002", "0006"].map(|sweep| folder.join(format!("drives/d0/sweep_{sweep}.pcd")));
@@ -88,10 +87,7 @@ fn flows_without_the_tracks_of_their_drive_are_missing_though_they_were_refused_
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     drives(folder, 1, "3");
-    let run = |output: &str, more: &[&str]| {
-        let tracked = ["drives", "-o", output, "--tracks", "--preset", "default"];
-        label(folder, &[&tracked[..], more].concat())
-    };
+    let run = |output: &str, more: &[&str]| tracked(folder, output, more);
     assert_eq!(run("reference", &[]).code, 0);
     let sweep = folder.join("drives/d0/sweep_0001.pcd");
     let sound = fs::read(&sweep).expect("written");

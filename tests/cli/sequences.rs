@@ -327,12 +327,17 @@ fn tracks_of_what_cannot_have_any_are_refused_before_any_work() {
     assert!(refused(&SWEEPS, &["--tracks-picture", "a.jpg"]).contains(".png"));
 }
 
+/// Writes a street with times of its points, at a speed at which it is deskewed.
+fn rolling_street(folder: &std::path::Path) {
+    let arguments = ["synth", "-o", "street", "--rolling", "--speed-mps", "25"];
+    assert_eq!(fnsf(folder, &arguments).code, 0);
+}
+
 #[test]
 fn rolling_sweeps_are_deskewed_and_their_flow_starts_from_the_deskewed_points() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    let arguments = ["synth", "-o", "street", "--rolling", "--speed-mps", "25"];
-    assert_eq!(fnsf(folder, &arguments).code, 0);
+    rolling_street(folder);
     let sweeps = ["flow", "street/sweep_0000.pcd", "street/sweep_0001.pcd"];
     let run = |options: &[&str]| json(folder, &[&sweeps[..], options, &["--json"]].concat());
     let report = run(&["-o", "flow.ply"]);
@@ -371,8 +376,7 @@ fn rolling_sweeps_are_deskewed_and_their_flow_starts_from_the_deskewed_points() 
 fn a_pair_with_the_newer_sweep_first_is_deskewed_against_the_direction_of_time() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    let arguments = ["synth", "-o", "street", "--rolling", "--speed-mps", "25"];
-    assert_eq!(fnsf(folder, &arguments).code, 0);
+    rolling_street(folder);
     let [earlier, later] = ["1700000000000.pcd", "1700000000100.pcd"];
     for (sweep, name) in [
         ("street/sweep_0000.pcd", earlier),
