@@ -22,7 +22,7 @@ const TRUNCATION_M: f32 = 0.3;
 ///
 /// `points` are N points in metres, each in the sensor's frame of its own time. `times` are N times
 /// in seconds after the sweep's time. `ego` is the motion of the sensor in `elapsed_s` seconds,
-/// target_from_source. It is below zero where the target is the earlier sweep.
+/// target_from_source. `elapsed_s` is below zero where the target is the earlier sweep.
 pub(crate) fn deskewed(
     points: &[Point],
     times: &[f32],

@@ -126,8 +126,8 @@ pub trait PreparedTarget: Send {
     ///
     /// # Errors
     /// - [`BackendError::Unsupported`] if the target was prepared for another kind of loss or for no
-    ///   cycle, or the device lacks the precision of `options`. A CPU has only single precision. Half precision
-    ///   needs a GPU whose matrix units pass their self-test. A GPU also lacks what
+    ///   cycle, or the device lacks the precision of `options`. A CPU has only single precision. Half
+    ///   precision needs a GPU whose matrix units pass their self-test. A GPU also lacks what
     ///   [`FieldOptions::runs_on_gpu`] excludes.
     /// - [`BackendError::Linear`] if an option of the linear model is out of range, or its grid needs
     ///   too much memory.

@@ -82,12 +82,13 @@ pub(crate) fn prepare_target(
         if let Some(loss) = loss.distance_mut() {
             loss.transform.set_cell(loss.transform.cell_m * coarser);
         }
-        let mut prepared = backend.prepare_target(source, target, &loss, control);
-        if let (Ok(target), true) = (&mut prepared, options.has_cycle())
-            && let Err(error) = target.prepare_cycle(source, control)
-        {
-            prepared = Err(error);
-        }
+        let prepared = backend.prepare_target(source, target, &loss, control);
+        let prepared = prepared.and_then(|mut target| {
+            if options.has_cycle() {
+                target.prepare_cycle(source, control)?;
+            }
+            Ok(target)
+        });
         match prepared {
             Ok(target) => Ok(Some(target)),
             Err(BackendError::Interrupted(Interrupt::Deadline)) => Ok(None),
