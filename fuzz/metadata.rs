@@ -109,9 +109,12 @@ pub(crate) fn names(bytes: &[u8]) -> Corpus {
                     );
                 }
             }
-            if let Some(seconds) = pair_interval_s([one, other], [None, None]) {
-                assert!(seconds > 0.0 && seconds <= 60.0);
+            let interval = pair_interval_s([one, other], [None, None]);
+            if let Some(seconds) = interval {
+                assert!(seconds.abs() > 0.0 && seconds.abs() <= 60.0);
             }
+            let reversed = pair_interval_s([other, one], [None, None]);
+            assert_eq!(interval, reversed.map(|seconds| -seconds));
         }
     }
     Corpus::Keep

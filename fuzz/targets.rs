@@ -160,7 +160,8 @@ pub(crate) fn note_panics() {
     let report = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |panic| {
         PANICKED.store(true, Relaxed);
-        report(panic);
+        // A backtrace can take more memory than the input may.
+        memory::uncounted(|| report(panic));
     }));
 }
 
