@@ -31,8 +31,8 @@ const NAMED: usize = 10;
 /// Label the pairs of many drives.
 ///
 /// Each pair has one output, whose name is a function of the pair, and which is written only where
-/// there is none. So any number of processes may label one manifest, be killed and started again:
-/// every pair is labelled once. Give each process a shard, and run `fnsf label ... --finalize` at the
+/// there is none, or where it lacks a sweep that can be read now. So any number of processes may label
+/// one manifest, be killed and started again. Give each process a shard, and run `fnsf label ... --finalize` at the
 /// end.
 ///
 /// A pair that cannot be labelled is reported and does not stop the others. SIGTERM and Ctrl-C
@@ -78,6 +78,13 @@ pub(super) struct Label {
     /// is then done by one process
     #[arg(long)]
     tracks: bool,
+    /// Do not read the times of points: no sweep is deskewed. Otherwise a pair is where it then fits
+    /// clearly better, and its flow and boxes are those of the deskewed points
+    #[arg(long)]
+    ignore_times: bool,
+    /// Refuse a pair whose estimate needs more memory than this
+    #[arg(long, value_name = "MIB", default_value_t = 8192, value_parser = clap::value_parser!(u32).range(1..))]
+    max_memory_mib: u32,
     /// Compare the outputs with the manifest, and write _report.csv and, if all is there, _SUCCESS
     #[arg(long, conflicts_with_all = ["shard", "shard_from_env"])]
     finalize: bool,
@@ -126,6 +133,16 @@ struct Summary<'a> {
     done: &'a Done,
 }
 
+/// Whether two places are one: the same folder of this machine, or the same prefix of a bucket.
+fn same_place(one: &str, other: &str) -> bool {
+    let [one, other] = [one, other].map(|text| {
+        let text = text.strip_prefix("file://").unwrap_or(text);
+        let folder = Path::new(text).canonicalize();
+        folder.unwrap_or_else(|_| text.trim_end_matches('/').into())
+    });
+    one == other
+}
+
 impl Label {
     pub(super) fn run(&self) -> Result<(), Failure> {
         let options = self.options()?;
@@ -133,12 +150,11 @@ impl Label {
         if !self.output.contains("://") && !self.finalize {
             let made = std::fs::create_dir_all(Path::new(&self.output));
             made.map_err(|error| Failure::usage(anyhow!("{}: {error}", self.output)))?;
-            let place = |text: &str| Path::new(text).canonicalize().ok();
-            let (_, input) = Dataset::of_place(&self.manifest);
-            if place(input).is_some_and(|input| place(&self.output) == Some(input)) {
-                let text = "the output is the folder of the sweeps: choose a folder of its own";
-                return Err(Failure::usage(anyhow!(text)));
-            }
+        }
+        let (_, input) = Dataset::of_place(&self.manifest);
+        if !self.finalize && same_place(input, &self.output) {
+            let text = "the output is the folder of the sweeps: choose a folder of its own";
+            return Err(Failure::usage(anyhow!(text)));
         }
         let output = Place::open(&self.output).map_err(LabelError::from)?;
         match self.finalize {
@@ -158,6 +174,11 @@ impl Label {
             ))
         } else if self.known_poses && matches!(options.ego, Some(EgoChoice::Off)) {
             Some("--known-poses gives the ego motion that --ego off leaves out".to_owned())
+        } else if self.shards.is_some() && !(self.shard_from_env || self.finalize) {
+            Some(
+                "--shards goes with --shard-from-env or --finalize; one part is --shard I/N"
+                    .to_owned(),
+            )
         } else if self.layout.needs_masks() != self.masks.is_some() {
             Some("--layout av2-v1 and --masks belong together".to_owned())
         } else if self.tracks && self.layout == Layout::Av2V2 {
@@ -206,6 +227,8 @@ impl Label {
             layout: self.layout,
             poses: self.known_poses,
             tracks: self.tracks,
+            ignore_times: self.ignore_times,
+            most_bytes: (self.max_memory_mib as usize) << 20,
             masks,
             shard,
             output,
@@ -272,6 +295,12 @@ impl Label {
             found.refused.len(),
             found.missing
         ))?;
+        if found.lacking_sweeps > 0 {
+            say(format_args!(
+                "  {} are labelled without a sweep around them that could not be read; another run tries again",
+                found.lacking_sweeps
+            ))?;
+        }
         say(format_args!("  wrote {}", output.uri("_report.csv")))?;
         name(&found.refused)?;
         if found.is_complete() {

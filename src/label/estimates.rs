@@ -1,16 +1,24 @@
 //! The estimates of a shard, pair by pair.
 
 use std::collections::BTreeMap;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::mpsc::{Receiver, Sender, SyncSender};
 
-use super::io::{At, Before, Io, Loaded, Output, Unread, Wanted};
-use super::layout::tracks_path;
+use super::io::{At, Io, Loaded, Output, Unread, Wanted, mark_text};
+use super::layout::{left_out_path, tracks_path};
 use super::report::{Outcome, RowReport};
 use super::types::Solver;
 use crate::flow::tracks::{Tracker, push_and_correct};
-use crate::flow::{Control, Ego, Estimate, FlowError, Point, WindowedPair, window};
+use crate::flow::{
+    Control, Ego, Estimate, FlowError, Method, Options, Point, Problem, Sweep, WindowedPair,
+    neighbor_cost, predict_cost, window,
+};
 use crate::formats::{SweepClock, pair_interval_s, read_av2_mask, write_tracks};
 use crate::job::MAX_DT_S;
+
+/// Upper bounds of the memory of an object search: bytes of any, and bytes for each point of both sweeps.
+const MIN_BYTES: usize = 64 << 20;
+const OBJECT_BYTES: usize = 640;
 
 /// The estimates, in order, with the sweeps that they need.
 pub(super) struct Estimates<'a> {
@@ -20,6 +28,8 @@ pub(super) struct Estimates<'a> {
     pub(super) outputs: SyncSender<Output>,
     pub(super) reports: Sender<RowReport>,
     pub(super) tracking: Tracking,
+    /// The last drive of which this run has written an output.
+    pub(super) changed: Option<usize>,
 }
 
 /// The tracks of the drive that is being labelled.
@@ -53,7 +63,10 @@ impl Estimates<'_> {
             _ => {}
         }
         let [source, target] = [wanted.pair, wanted.pair + 1].map(|at| &drive.sweeps[at].uri);
-        let mut report = RowReport::new(drive.key(wanted.pair), source, target);
+        let mut report = RowReport {
+            was_there: wanted.is_there,
+            ..RowReport::new(drive.key(wanted.pair), source, target)
+        };
         let done = self.estimate(wanted, solver, control, &mut report);
         if let Err((outcome, reason)) = done {
             let _the_tally_is_there = self.reports.send(report.ended(outcome, &reason));
@@ -99,6 +112,10 @@ impl Estimates<'_> {
             }
             report.left_out.push(unread.reason.clone());
         }
+        let is_current = self.is_current(wanted, &report.left_out);
+        if is_current && !inputs.tracks {
+            return Ok(());
+        }
         let mask = self.mask(wanted)?;
         let pair = [wanted.pair, wanted.pair + 1];
         let [source, target] = pair.map(|index| loaded(index).expect("both sweeps were read"));
@@ -119,8 +136,17 @@ impl Estimates<'_> {
             before: None,
         };
         let sweep = |index: usize| Some(&loaded(index)?.sweep);
-        let solved =
-            solver.solve(&|backend| windowed.estimate(backend, sweep, &solver_options, control));
+        let neighbors = window(wanted.pair, count, size).filter(|index| !pair.contains(index));
+        let neighbors = neighbors.filter_map(|index| Some(loaded(index)?.points.len()));
+        let clouds = [&source.sweep, &target.sweep];
+        self.check_memory(clouds, neighbors, &solver_options)?;
+        let solve =
+            || solver.solve(&|backend| windowed.estimate(backend, sweep, &solver_options, control));
+        // One pair must not end the others.
+        let solved = catch_unwind(AssertUnwindSafe(solve)).map_err(|_| {
+            let text = "its estimate has panicked: this is a defect of the program";
+            (Outcome::Refused, text.to_owned())
+        })?;
         let mut estimate = solved.map_err(|error| failed(&error))?;
         let [source, target] = estimate.sweeps([&source.points, &target.points]);
         if inputs.tracks {
@@ -133,11 +159,60 @@ impl Estimates<'_> {
                 tracked.map_err(|error| (Outcome::Refused, error.to_string()))?;
             }
         }
-        if wanted.before == Before::Output {
+        // Flows after one that has changed, and those of a drive that was interrupted, may have the
+        // motions of other tracks.
+        let is_retracked = !wanted.has_tracks || self.changed == Some(wanted.drive);
+        if is_current && !is_retracked {
             return Ok(());
         }
         self.put(wanted, &source, &estimate, mask.as_deref(), report.clone());
         Ok(())
+    }
+
+    /// Whether an output is there that would not change: it lacks no sweep, or the same ones as now.
+    fn is_current(&self, wanted: &Wanted, left_out: &[String]) -> bool {
+        if !wanted.is_there || !wanted.is_marked {
+            return wanted.is_there;
+        }
+        let path = left_out_path(&wanted.path);
+        let read = || self.io.runtime.block_on(self.io.inputs.output.read(&path));
+        let mark = self.io.patiently(read);
+        !left_out.is_empty() && mark.is_ok_and(|mark| mark == mark_text(left_out))
+    }
+
+    /// Refuses a pair that needs more memory than a run may take. `neighbors` are the numbers of points
+    /// of the sweeps around it.
+    fn check_memory(
+        &self,
+        [source, target]: [&Sweep; 2],
+        neighbors: impl Iterator<Item = usize>,
+        options: &Options,
+    ) -> Result<(), (Outcome, String)> {
+        let most = self.io.inputs.most_bytes;
+        let neighbors: usize = neighbors.map(|points| neighbor_cost(points).bytes).sum();
+        let points = source.points.len() + target.points.len();
+        // The prediction takes longer, and is left out where this bound suffices.
+        let bound = MIN_BYTES + points * OBJECT_BYTES + neighbors;
+        if matches!(options.method, Method::Objects(_)) && bound <= most {
+            return Ok(());
+        }
+        let ground = source.ground.as_deref().zip(target.ground.as_deref());
+        let problem = Problem {
+            ground: ground.map(<[_; 2]>::from),
+            ..Problem::pair(&source.points, &target.points)
+        };
+        let cost = predict_cost(&problem, options).map_err(|error| failed(&error))?;
+        match (cost.bytes + neighbors).checked_sub(most) {
+            Some(1..) => Err((
+                Outcome::Refused,
+                format!(
+                    "it needs {} MiB of memory, and --max-memory-mib allows {}: crop with --crop-m",
+                    (cost.bytes + neighbors) >> 20,
+                    most >> 20
+                ),
+            )),
+            _ => Ok(()),
+        }
     }
 
     /// Takes the sweeps of a window, and drops those that no later pair needs.
@@ -190,20 +265,21 @@ impl Estimates<'_> {
     }
 
     fn put(
-        &self,
+        &mut self,
         wanted: &Wanted,
         source: &[Point],
         estimate: &Estimate,
         mask: Option<&[bool]>,
         report: RowReport,
     ) {
-        let is_gap = wanted.before == Before::Gap;
         let drive = &self.io.inputs.plan.drives()[wanted.drive];
+        let is_first = self.changed.replace(wanted.drive) != Some(wanted.drive);
         let output = Output {
             drive: wanted.drive,
             path: wanted.path.clone(),
-            replaces: wanted.before == Before::Untracked,
-            removes: is_gap.then(|| tracks_path(&drive.name)),
+            replaces: wanted.is_there,
+            removes: (is_first && wanted.has_tracks).then(|| tracks_path(&drive.name)),
+            is_marked: wanted.is_marked,
             bytes: self.io.inputs.layout.bytes(source, estimate, mask),
             report: report.with(estimate),
         };
@@ -232,6 +308,7 @@ impl Estimates<'_> {
             path,
             replaces: true,
             removes: None,
+            is_marked: false,
             bytes: written.map(|()| bytes),
         }))
     }

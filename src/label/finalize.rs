@@ -7,7 +7,7 @@ use bytes::Bytes;
 use tokio::runtime::Builder;
 
 use super::error::LabelError;
-use super::layout::{Layout, SETTINGS_FILE, check_outputs, tracks_path};
+use super::layout::{Layout, SETTINGS_FILE, check_outputs, left_out_path, tracks_path};
 use super::places::{Place, PlaceError};
 use super::plan::Plan;
 use super::report::{Outcome, RowReport, read_lines};
@@ -28,6 +28,8 @@ pub struct Finalized {
     pub pairs: usize,
     /// Pairs whose output is there.
     pub labelled: usize,
+    /// Labelled pairs that lack a sweep of their window, because it could not be read.
+    pub lacking_sweeps: usize,
     /// Pairs that cannot be labelled.
     pub refused: Vec<RowReport>,
     /// Pairs that are to be tried again.
@@ -86,7 +88,8 @@ pub fn finalize(
         let before = plan.pairs_before();
         let mut table = csv::Writer::from_writer(Vec::new());
         let heading = [
-            "key", "source", "target", "outcome", "error", "seconds", "points", "moving", "overlap",
+            "key", "source", "target", "outcome", "error", "seconds", "points", "moving",
+            "overlap", "deskewed", "left_out",
         ];
         let unwritten = |error: csv::Error| LabelError::Machine(std::io::Error::other(error));
         table.write_record(heading).map_err(unwritten)?;
@@ -94,7 +97,9 @@ pub fn finalize(
         for (drive, pair) in plan.all_pairs().filter(|&(_, pair)| layout.asks_for(pair)) {
             let of = &plan.drives()[drive];
             let key = of.key(pair);
-            let has_flow = all.contains(&layout.path(&of.name, pair, &key));
+            let path = layout.path(&of.name, pair, &key);
+            let has_flow = all.contains(&path);
+            let lacks_sweep = all.contains(&left_out_path(&path));
             let is_there = has_flow && (!whole || all.contains(&tracks_path(&of.name)));
             let last = latest.get(&key);
             let report = labelled.get(&key).filter(|_| is_there).or(last);
@@ -104,6 +109,7 @@ pub fn finalize(
             let outcome = match (is_there, refused) {
                 (true, _) => {
                     found.labelled += 1;
+                    found.lacking_sweeps += usize::from(lacks_sweep);
                     "labelled"
                 }
                 (false, Some(refused)) => {
@@ -129,6 +135,11 @@ pub fn finalize(
                     number(report.and_then(|of| of.points).map(|n| n.to_string())),
                     number(report.and_then(|of| of.moving).map(|n| n.to_string())),
                     number(report.and_then(|of| of.overlap).map(|o| format!("{o:.4}"))),
+                    number(report.and_then(|of| of.deskewed).map(|is| is.to_string())),
+                    number(report.map(|of| match lacks_sweep {
+                        true => of.left_out.len().to_string(),
+                        false => "0".to_owned(),
+                    })),
                 ])
                 .map_err(unwritten)?;
         }

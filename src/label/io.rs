@@ -8,11 +8,12 @@ use std::time::Duration;
 use bytes::Bytes;
 use tokio::runtime::Runtime;
 
+use super::layout::left_out_path;
 use super::places::{PlaceError, Places};
 use super::report::{Outcome, RowReport};
 use super::types::Inputs;
 use crate::flow::{Point, Sweep};
-use crate::formats::{FormatError, PointTimes, SweepClock, read_timed_cloud};
+use crate::formats::{FormatError, PointTimes, SweepClock, read_timed_cloud, sweep_time_s};
 
 /// Times that a store is asked before a pair has failed.
 const ATTEMPTS: u32 = 4;
@@ -24,22 +25,12 @@ pub(super) struct Wanted {
     pub(super) pair: usize,
     /// The name of its output.
     pub(super) path: String,
-    pub(super) before: Before,
-}
-
-/// What is there of a pair's output before it is computed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Before {
-    /// Nothing.
-    Nothing,
-    /// The output: the pair is computed for the tracks of its drive alone.
-    Output,
-    /// Nothing, because an earlier run could not label the pair: the tracks of its drive end before it.
-    /// They are removed before its output is written.
-    Gap,
-    /// An output that may lack the motions of tracks: a pair before it was not labelled, or its drive
-    /// has no tracks yet. It is replaced.
-    Untracked,
+    /// Whether its output is there.
+    pub(super) is_there: bool,
+    /// Whether the mark that its output lacks a sweep of its window is there.
+    pub(super) is_marked: bool,
+    /// Whether the tracks of its drive are there.
+    pub(super) has_tracks: bool,
 }
 
 /// A sweep of the plan: the indices of its drive and of the sweep.
@@ -68,6 +59,8 @@ pub(super) struct Output {
     pub(super) replaces: bool,
     /// A file that is removed before.
     pub(super) removes: Option<String>,
+    /// Whether the mark that it lacks a sweep is there.
+    pub(super) is_marked: bool,
     pub(super) bytes: Result<Vec<u8>, FormatError>,
     pub(super) report: RowReport,
 }
@@ -80,12 +73,24 @@ pub(super) struct Io<'a> {
     pub(super) stop: &'a AtomicBool,
 }
 
+/// The text of a mark: which sweeps could not be read, and why.
+pub(super) fn mark_text(left_out: &[String]) -> Bytes {
+    Bytes::from(left_out.join("\n") + "\n")
+}
+
 impl Io<'_> {
-    /// Reads a sweep. A store that fails is asked again after a pause.
-    pub(super) fn read(&self, places: &Places, uri: &str) -> Result<Loaded, Unread> {
+    /// Reads a sweep. A store that fails is asked again after a pause. `time_s` is its time, where the
+    /// plan has one for all sweeps of its drive.
+    pub(super) fn read(
+        &self,
+        places: &Places,
+        uri: &str,
+        time_s: Option<f64>,
+    ) -> Result<Loaded, Unread> {
         let bytes = self.patiently(|| self.runtime.block_on(places.read(uri)));
         let bytes = bytes.map_err(|error| Unread {
-            may_pass: error.may_pass(),
+            // A node may lack the variables of a bucket that others have.
+            may_pass: error.may_pass() || matches!(error, PlaceError::Bucket(_)),
             reason: error.to_string(),
         })?;
         let name = uri.rsplit('/').next();
@@ -97,7 +102,11 @@ impl Io<'_> {
         let sweep = Sweep {
             points: read.cloud.points,
             ground: None,
-            times: read.times.map(|times| times.offsets_s),
+            time_s: time_s.or_else(|| sweep_time_s(uri, clock)),
+            times: read
+                .times
+                .filter(|_| !self.inputs.ignore_times)
+                .map(|times| times.offsets_s),
         };
         Ok(Loaded {
             points: sweep.points.as_slice().into(),
@@ -134,11 +143,26 @@ impl Io<'_> {
             Ok(bytes) => Bytes::from(bytes),
         };
         let place = &self.inputs.output;
-        if let Some(path) = &output.removes {
-            match self.patiently(|| self.runtime.block_on(place.remove(path))) {
-                Ok(()) | Err(PlaceError::Missing(_)) => {}
-                Err(error) => return output.report.ended(Outcome::Failed, &error),
+        let remove = |path: &str| match self.patiently(|| self.runtime.block_on(place.remove(path)))
+        {
+            Err(PlaceError::Missing(_)) => Ok(()),
+            removed => removed,
+        };
+        let mark = left_out_path(&output.path);
+        let left_out = &output.report.left_out;
+        // The mark is there whenever the label is.
+        let prepared = output.removes.as_deref().map_or(Ok(()), remove);
+        let prepared = prepared.and_then(|()| match left_out.is_empty() {
+            true => Ok(()),
+            false => {
+                let text = mark_text(left_out);
+                self.patiently(|| self.runtime.block_on(place.put(&mark, text.clone())))
             }
+        });
+        if let Err(error) = prepared {
+            return output
+                .report
+                .ended(Outcome::of_trouble(error.may_pass()), &error);
         }
         let put = || {
             let (path, bytes) = (&output.path, bytes.clone());
@@ -149,8 +173,15 @@ impl Io<'_> {
                 }
             })
         };
+        let written = self.patiently(put).and_then(|is_new| {
+            // The label of another process may lack it.
+            if is_new && output.is_marked && left_out.is_empty() {
+                remove(&mark)?;
+            }
+            Ok(is_new)
+        });
         let mut report = output.report;
-        match self.patiently(put) {
+        match written {
             Ok(true) => report.outcome = Outcome::Labelled,
             Ok(false) => report.outcome = Outcome::Raced,
             Err(error) => return report.ended(Outcome::of_trouble(error.may_pass()), &error),

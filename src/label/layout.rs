@@ -112,6 +112,9 @@ impl Layout {
     }
 }
 
+/// The folder of the marks.
+pub(super) const LEFT_OUT: &str = "_left_out";
+
 /// Checks the names of the outputs: each is used once, and none is the folder of another output.
 pub(super) fn check_outputs(plan: &Plan, layout: Layout, tracks: bool) -> Result<(), PlanError> {
     let mut known: HashMap<String, &str> = HashMap::new();
@@ -142,6 +145,12 @@ pub(super) fn check_outputs(plan: &Plan, layout: Layout, tracks: bool) -> Result
         }
     }
     Ok(())
+}
+
+/// The mark of a label that was computed without a sweep of its window, by the label's name. It says
+/// which sweep could not be read.
+pub(super) fn left_out_path(path: &str) -> String {
+    format!("{LEFT_OUT}/{path}.txt")
 }
 
 /// The file of a drive's tracks.

@@ -5,8 +5,8 @@
 //! ```
 //!
 //! The processes share nothing but the output. The name of a pair's output is a function of the pair,
-//! and an output is written only where there is none. So a process that dies loses the pair that it
-//! computed, and two that do the same pair leave one output.
+//! and an output is written only where there is none, or where it lacks a sweep that can be read now. So
+//! a process that dies loses the pair that it computed, and two that do the same pair leave one output.
 
 mod datasets;
 mod error;

@@ -59,6 +59,7 @@ pub(super) fn label(
             outputs,
             reports,
             tracking: Tracking::NotBegun,
+            changed: None,
         };
         let mut tally = Tally::new(io, wanted, total, &reported);
         for wanted in wanted {
@@ -79,16 +80,21 @@ pub(super) fn label(
 fn read_ahead(io: &Io<'_>, wanted: &[Wanted], sweeps: &SyncSender<(At, Result<Loaded, Unread>)>) {
     let places = Places::default();
     let size = io.inputs.options.solver_options(0).sweeps();
-    let mut next: HashMap<usize, usize> = HashMap::new();
+    let mut next: HashMap<usize, (usize, bool)> = HashMap::new();
     for wanted in wanted {
         let drive = &io.inputs.plan.drives()[wanted.drive];
-        let next = next.entry(wanted.drive).or_insert(0);
+        // Clocks are not mixed.
+        let of_drive = || (0, drive.sweeps.iter().all(|sweep| sweep.time_s.is_some()));
+        let (next, is_timed) = next.entry(wanted.drive).or_insert_with(of_drive);
+        let is_timed = *is_timed;
         for index in window(wanted.pair, drive.sweeps.len(), size) {
             if index < *next {
                 continue;
             }
             *next = index + 1;
-            let loaded = io.read(&places, &drive.sweeps[index].uri);
+            let sweep = &drive.sweeps[index];
+            let time_s = sweep.time_s.filter(|_| is_timed);
+            let loaded = io.read(&places, &sweep.uri, time_s);
             if sweeps.send(((wanted.drive, index), loaded)).is_err() {
                 return;
             }

@@ -268,8 +268,8 @@ impl Place {
 
     /// Removes the remains of writes of a run's files that were cut off more than `age` ago.
     pub(super) fn remove_cut_off(&self, age: Duration) -> Result<usize, PlaceError> {
-        const ENDINGS: [&str; 7] = [
-            ".npz", ".feather", ".label", ".json", ".jsonl", ".csv", "_SUCCESS",
+        const ENDINGS: [&str; 8] = [
+            ".npz", ".feather", ".label", ".json", ".jsonl", ".csv", ".txt", "_SUCCESS",
         ];
         let removed = self.objects.remove_cut_off(&ENDINGS, age);
         removed.map_err(|error| PlaceError::new(&self.uri(""), error))
@@ -282,9 +282,9 @@ impl Place {
     }
 }
 
-/// Whether a link leads to nothing that exists, or in a circle.
+/// Whether a link leads to nothing that exists, through a file, or in a circle.
 fn leads_nowhere(error: &io::Error) -> bool {
-    error.kind() == ErrorKind::NotFound
+    matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory)
         || rustix::io::Errno::from_io_error(error) == Some(rustix::io::Errno::LOOP)
 }
 
@@ -307,7 +307,10 @@ fn folder_entries(folder: &Path) -> io::Result<[Vec<String>; 2]> {
             match fs::metadata(entry.path()) {
                 Ok(about) => kind = about.file_type(),
                 Err(error) if leads_nowhere(&error) => {}
-                Err(error) => return Err(error),
+                Err(error) => {
+                    let message = format!("{name}: {error}");
+                    return Err(io::Error::new(error.kind(), message));
+                }
             }
         }
         match kind.is_dir() {

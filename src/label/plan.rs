@@ -3,6 +3,7 @@
 use std::collections::HashMap;
 
 use crate::flow::RigidTransform;
+use crate::formats::turning_sweep;
 
 /// One sweep of a drive.
 #[derive(Clone, Debug, PartialEq)]
@@ -49,11 +50,11 @@ impl Drive {
     }
 }
 
-/// The name of an output in the folder of its drive. A drive without a name has none.
-pub(super) fn below(drive: &str, name: &str) -> String {
-    match drive.is_empty() {
+/// The path of a file or folder in a folder. An empty folder, and a drive without a name, is the place itself.
+pub(super) fn below(folder: &str, name: &str) -> String {
+    match folder.is_empty() {
         true => name.to_owned(),
-        false => format!("{drive}/{name}"),
+        false => format!("{folder}/{name}"),
     }
 }
 
@@ -72,6 +73,17 @@ pub enum PlanError {
         second: String,
         /// The name of the output.
         key: String,
+    },
+    /// The sweeps of a drive go back in time.
+    #[error(
+        "{sweep} is followed by an earlier sweep, against the order of drive {drive:?}: sort the rows of the \
+         manifest, or label them as they are with --force"
+    )]
+    Order {
+        /// The name of the drive.
+        drive: String,
+        /// The sweep before the turn.
+        sweep: String,
     },
     /// The output of one pair is the folder of another one's.
     #[error(
@@ -117,6 +129,35 @@ impl Plan {
             }
         }
         Ok(Self { drives })
+    }
+
+    /// Checks that the times of the sweeps of each drive, or the numbers in their names, go one way.
+    ///
+    /// # Errors
+    /// [`PlanError::Order`].
+    pub(super) fn check_order(&self) -> Result<(), PlanError> {
+        for drive in &self.drives {
+            let times: Option<Vec<f64>> = drive.sweeps.iter().map(|sweep| sweep.time_s).collect();
+            let turn = match times {
+                Some(times) => {
+                    let ways = times.windows(2).map(|pair| pair[1].total_cmp(&pair[0]));
+                    let mut ways = ways.enumerate().filter(|(_, way)| way.is_ne());
+                    let first = ways.next().map(|(_, way)| way);
+                    ways.find(|&(_, way)| Some(way) != first).map(|(at, _)| at)
+                }
+                None => {
+                    let names: Vec<&str> = drive.sweeps.iter().map(|s| s.uri.as_str()).collect();
+                    turning_sweep(&names)
+                }
+            };
+            if let Some(turn) = turn {
+                return Err(PlanError::Order {
+                    drive: drive.name.clone(),
+                    sweep: drive.sweeps[turn].uri.clone(),
+                });
+            }
+        }
+        Ok(())
     }
 
     /// The drives.
@@ -230,6 +271,32 @@ mod tests {
         let twice = Plan::new(vec![drive("a", &["0", "1"]), drive("a", &["0", "2"])]);
         assert!(matches!(twice, Err(PlanError::SameKey { .. })));
         assert_eq!(Plan::new(vec![drive("a", &["0"])]), Err(PlanError::Empty));
+    }
+
+    #[test]
+    fn sweeps_that_go_back_in_time_are_no_plan() {
+        let check = |keys: &[&str], times: &[f64]| {
+            let mut drive = drive("a", keys);
+            for (sweep, &time) in drive.sweeps.iter_mut().zip(times) {
+                sweep.time_s = Some(time);
+            }
+            Plan::new(vec![drive]).expect("a plan").check_order()
+        };
+        for (keys, times) in [
+            (&["1", "2", "10"], &[][..]),
+            (&["10", "2", "1"], &[]),
+            (&["a", "c", "b"], &[]),
+            (&["3", "1", "2"], &[0.0, 0.0, 0.1]),
+        ] {
+            assert_eq!(check(keys, times), Ok(()), "{keys:?} {times:?}");
+        }
+        for (keys, times) in [
+            (&["1", "10", "2"], &[][..]),
+            (&["1", "2", "3"], &[0.0, 0.2, 0.1]),
+        ] {
+            let turned = check(keys, times).expect_err("a turn").to_string();
+            assert!(turned.contains(keys[1]), "{turned}");
+        }
     }
 
     #[test]

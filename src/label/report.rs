@@ -54,9 +54,15 @@ pub struct RowReport {
     /// Share of the scene that both sweeps show, 0 to 1.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub overlap: Option<f32>,
+    /// Whether its flow starts from deskewed points, where they have times.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub deskewed: Option<bool>,
     /// Whether it is of the tracks of a drive, and not of a pair.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub tracks: bool,
+    /// Whether its output was there before.
+    #[serde(skip)]
+    pub was_there: bool,
     /// Sweeps around the pair that could not be read, and were left out.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub left_out: Vec<String>,
@@ -75,7 +81,9 @@ impl RowReport {
             points: None,
             moving: None,
             overlap: None,
+            deskewed: None,
             tracks: false,
+            was_there: false,
             left_out: Vec::new(),
         }
     }
@@ -87,6 +95,8 @@ impl RowReport {
         let objects = estimate.objects();
         self.moving = objects.map(|of| of.clusters.iter().filter(|one| one.dynamic).count());
         self.overlap = estimate.overlap;
+        let deskew = estimate.deskew.as_ref();
+        self.deskewed = deskew.map(|deskew| deskew.points.is_some());
         self
     }
 

@@ -8,8 +8,8 @@ use tokio::runtime::{Builder, Runtime};
 
 use super::datasets::{Dataset, drives_of};
 use super::error::LabelError;
-use super::io::{Before, Io, Wanted};
-use super::layout::{check_outputs, tracks_path};
+use super::io::{Io, Wanted};
+use super::layout::{LEFT_OUT, check_outputs, left_out_path, tracks_path};
 use super::manifest::read_manifest;
 use super::pipeline::label;
 use super::places::{Place, PlaceError, Places};
@@ -74,6 +74,10 @@ async fn present(
     let mut found = HashSet::new();
     for drive in drives {
         found.extend(inputs.output.all(drive).await?);
+        if !drive.is_empty() {
+            let marks = format!("{LEFT_OUT}/{drive}");
+            found.extend(inputs.output.all(&marks).await?);
+        }
     }
     Ok(found)
 }
@@ -90,53 +94,31 @@ async fn wanted(inputs: &Inputs<'_>) -> Result<(usize, Vec<Wanted>), LabelError>
         .map(|(drive, pair)| {
             let of = &plan.drives()[drive];
             let path = layout.path(&of.name, pair, &of.key(pair));
-            let before = match present.contains(&path) {
-                true => Before::Output,
-                false => Before::Nothing,
-            };
+            let has_tracks = inputs.tracks && present.contains(&tracks_path(&of.name));
             Wanted {
                 drive,
                 pair,
+                is_there: present.contains(&path),
+                is_marked: present.contains(&left_out_path(&path)),
+                has_tracks,
                 path,
-                before,
             }
         })
         .collect();
-    if inputs.tracks {
-        let has_tracks = |drive: usize| present.contains(&tracks_path(&plan.drives()[drive].name));
-        all = all
-            .chunk_by(|one, next| one.drive == next.drive)
-            .flat_map(|drive| of_tracked_drive(drive, has_tracks(drive[0].drive)))
-            .collect();
-    } else {
-        all.retain(|wanted| wanted.before == Before::Nothing);
+    let is_done = |wanted: &Wanted| wanted.is_there && !wanted.is_marked;
+    match inputs.tracks {
+        // Tracks need all pairs of their drive.
+        true => {
+            all = all
+                .chunk_by(|one, next| one.drive == next.drive)
+                .filter(|drive| !(drive[0].has_tracks && drive.iter().all(is_done)))
+                .flatten()
+                .cloned()
+                .collect();
+        }
+        false => all.retain(|wanted| !is_done(wanted)),
     }
     Ok((total, all))
-}
-
-/// What is to be computed of a drive whose tracks are wanted: nothing if all of it is there, and
-/// otherwise all pairs, because tracks need them. Where there are tracks and a pair is missing, the pair
-/// was refused, the tracks end before it, and the flows after it are without them. Where there are no
-/// tracks, an earlier run was interrupted, perhaps between flows with and without them.
-fn of_tracked_drive(pairs: &[Wanted], has_tracks: bool) -> Vec<Wanted> {
-    let missing = pairs
-        .iter()
-        .position(|wanted| wanted.before == Before::Nothing);
-    if missing.is_none() && has_tracks {
-        return Vec::new();
-    }
-    let mut pairs = pairs.to_vec();
-    let mut first = 0;
-    if let Some(gap) = missing.filter(|_| has_tracks) {
-        pairs[gap].before = Before::Gap;
-        first = gap;
-    }
-    for wanted in &mut pairs[first..] {
-        if wanted.before == Before::Output {
-            wanted.before = Before::Untracked;
-        }
-    }
-    pairs
 }
 
 /// Labels the pairs of a shard whose outputs are not there. When `stop` becomes true, the pair that
@@ -153,6 +135,9 @@ pub fn run(
 ) -> Result<Done, LabelError> {
     let began = Instant::now();
     check_outputs(inputs.plan, inputs.layout, inputs.tracks)?;
+    if !inputs.options.force {
+        inputs.plan.check_order()?;
+    }
     if inputs.poses {
         for drive in inputs.plan.drives() {
             if let Some(sweep) = drive.sweeps.iter().find(|sweep| sweep.pose.is_none()) {

@@ -22,6 +22,8 @@ pub struct Settings {
     pub poses: bool,
     /// Whether tracks are written, and correct the flows.
     pub tracks: bool,
+    /// Whether the times of points are not read.
+    pub ignore_times: bool,
     /// Where the masks are, for a layout that asks for them.
     pub masks: Option<String>,
     /// Number of pairs of the plan.
@@ -44,6 +46,7 @@ impl Settings {
             layout: inputs.layout.name().to_owned(),
             poses: inputs.poses,
             tracks: inputs.tracks,
+            ignore_times: inputs.ignore_times,
             masks: inputs.masks.as_ref().map(|masks| masks.uri("")),
             pairs: inputs.plan.pairs(),
             plan: inputs.plan.hash(inputs.poses),

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 
 use super::error::LabelError;
-use super::io::{Before, Io, Wanted};
+use super::io::{Io, Wanted};
 use super::places::PlaceError;
 use super::report::{Outcome, RowReport, lines};
 use super::types::{Done, Told};
@@ -39,10 +39,7 @@ impl<'a> Tally<'a> {
     ) -> Self {
         let shard = io.inputs.shard;
         let attempt = uuid::Uuid::now_v7();
-        let waiting = wanted
-            .iter()
-            .filter(|wanted| wanted.before != Before::Output)
-            .count();
+        let waiting = wanted.iter().filter(|wanted| !wanted.is_there).count();
         Self {
             io,
             reported,
@@ -82,6 +79,7 @@ impl<'a> Tally<'a> {
 
     fn count(&mut self, report: RowReport) {
         let is_pair = !report.tracks;
+        self.done.found -= usize::from(report.was_there);
         match report.outcome {
             Outcome::Labelled => self.done.labelled += usize::from(is_pair),
             Outcome::Raced => self.done.raced += usize::from(is_pair),

@@ -26,6 +26,10 @@ pub struct Inputs<'a> {
     pub tracks: bool,
     /// Where the masks of [`Layout::needs_masks`] are: `DRIVE/TIMESTAMP.feather` with a column `mask`.
     pub masks: Option<Place>,
+    /// Whether the times of points are not read, so that no sweep is deskewed.
+    pub ignore_times: bool,
+    /// Memory that the estimate of a pair may take, bytes. A pair that needs more is refused.
+    pub most_bytes: usize,
     /// The part of the plan.
     pub shard: Shard,
     /// Where the outputs go.

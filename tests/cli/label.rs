@@ -245,11 +245,22 @@ fn rows_that_cannot_be_used_are_reported_and_do_not_stop_the_others() {
         "{}",
         end.stdout
     );
-    // The file is mended: what was refused is done.
+    // All other windows have the damaged sweep.
+    let lacking = "5 are labelled without a sweep";
+    assert!(end.stdout.contains(lacking), "{}", end.stdout);
+    // The file is mended: all labels are those of a run that has never seen it damaged.
     fs::write(&cut, &bytes).expect("writable");
-    let rest = label(folder, &["drives", "-o", "labels"]);
-    assert_eq!(rest.code, 0, "{}", rest.stderr);
-    assert_eq!(labels(&folder.join("labels")).len(), 7);
+    for output in ["labels", "whole"] {
+        let done = label(folder, &["drives", "-o", output]);
+        assert_eq!(done.code, 0, "{}", done.stderr);
+    }
+    let found = labels(&folder.join("labels"));
+    assert_eq!(found.len(), 7);
+    assert_same(&found, &labels(&folder.join("whole")));
+    let end = label(folder, &["drives", "-o", "labels", "--finalize"]);
+    assert!(!end.stdout.contains("without a sweep"), "{}", end.stdout);
+    let again = label(folder, &["drives", "-o", "labels"]);
+    assert!(again.stdout.contains("0 of 7 pairs"), "{}", again.stdout);
 }
 
 #[test]

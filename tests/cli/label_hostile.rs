@@ -88,7 +88,7 @@ fn names_and_files_that_cannot_work_are_refused_and_do_not_hang() {
 }
 
 #[test]
-fn a_pipe_in_the_place_of_poses_is_refused_and_does_not_hang() {
+fn a_pipe_in_the_place_of_poses_does_not_hang_and_matters_only_where_poses_are_asked_for() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     drives(folder, 1, "3");
@@ -101,8 +101,10 @@ fn a_pipe_in_the_place_of_poses_is_refused_and_does_not_hang() {
     let poses = folder.join("av2/log/city_SE3_egovehicle.feather");
     let made = Command::new("mkfifo").arg(&poses).status();
     assert!(made.expect("mkfifo").success());
-    let refused = label(folder, &["av2", "-o", "labels"]);
-    assert_eq!(refused.code, 65, "{}", refused.stderr);
+    let done = label(folder, &["av2", "-o", "labels"]);
+    assert_eq!(done.code, 0, "{}", done.stderr);
+    let refused = label(folder, &["av2", "-o", "posed", "--known-poses"]);
+    assert_eq!(refused.code, 2, "{}", refused.stderr);
     assert!(
         refused.stderr.contains("city_SE3_egovehicle"),
         "{}",
@@ -149,4 +151,17 @@ fn the_end_of_a_run_removes_its_own_remains_alone() {
         assert!(folder.join(name).exists(), "{name}");
     }
     assert!(!folder.join(remains).exists());
+}
+
+#[test]
+fn a_pair_that_needs_more_memory_than_the_run_may_take_is_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    drives(folder, 1, "2");
+    let done = label(
+        folder,
+        &["drives", "-o", "labels", "--max-memory-mib", "16"],
+    );
+    assert_eq!(done.code, 65, "{}", done.stderr);
+    assert!(done.stdout.contains("allows 16"), "{}", done.stdout);
 }

@@ -45,6 +45,34 @@ fn a_mended_sweep_gives_the_tracks_and_the_flows_of_a_drive_without_fault() {
 }
 
 #[test]
+fn a_rerun_while_a_sweep_is_damaged_leaves_labels_and_tracks_alone() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    drives(folder, 1, "8");
+    let run = |output: &str| label(folder, &["drives", "-o", output, "--tracks"]);
+    assert_eq!(run("reference").code, 0);
+    let sweep = folder.join("drives/d0/sweep_0003.pcd");
+    let bytes = fs::read(&sweep).expect("written");
+    fs::write(&sweep, &bytes[..bytes.len() / 2]).expect("writable");
+    assert_eq!(run("labels").code, 65);
+    let modified = || {
+        let file = folder.join("labels/d0/sweep_0000.npz");
+        let about = fs::metadata(file).expect("a label");
+        about.modified().expect("a time")
+    };
+    let (before, written) = (labels(&folder.join("labels")), modified());
+    assert_eq!(run("labels").code, 65);
+    assert_same(&labels(&folder.join("labels")), &before);
+    assert_eq!(modified(), written);
+    fs::write(&sweep, &bytes).expect("writable");
+    let mended = run("labels");
+    assert_eq!(mended.code, 0, "{}", mended.stderr);
+    let reference = labels(&folder.join("reference"));
+    assert!(before["d0/sweep_0000.npz"] != reference["d0/sweep_0000.npz"]);
+    assert_same(&labels(&folder.join("labels")), &reference);
+}
+
+#[test]
 fn a_repair_that_is_interrupted_is_done_by_the_next_run() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();

@@ -6,7 +6,7 @@ use super::dataset::{Dataset, DatasetError};
 use crate::formats::{compare_names, read_poses};
 use crate::label::layout::SETTINGS_FILE;
 use crate::label::places::{Place, PlaceError};
-use crate::label::plan::{Drive, DriveSweep, drive_name, key_of, stem};
+use crate::label::plan::{Drive, DriveSweep, below, drive_name, key_of, stem};
 
 /// Endings of sweeps.
 const ENDINGS: [&str; 6] = [".pcd", ".ply", ".bin", ".npy", ".feather", ".las"];
@@ -36,6 +36,13 @@ fn name(folder: &str) -> String {
     drive_name(bare.unwrap_or(folder))
 }
 
+/// Whether a folder with settings is the output of a run, which may lie below its input.
+async fn is_output(place: &Place, folder: &str) -> Result<bool, DatasetError> {
+    let bytes = place.read(&below(folder, SETTINGS_FILE)).await?;
+    let settings: serde_json::Value = serde_json::from_slice(&bytes).unwrap_or_default();
+    Ok(settings["fnsf"].is_string() && settings["plan"].is_string())
+}
+
 /// The drives below a place: folders with two sweeps or more.
 pub(super) async fn drives(place: &Place, dataset: Dataset) -> Result<Vec<Drive>, DatasetError> {
     let mut drives = Vec::new();
@@ -49,8 +56,7 @@ pub(super) async fn drives(place: &Place, dataset: Dataset) -> Result<Vec<Drive>
             continue;
         }
         let [folders, files] = place.entries(&folder).await?;
-        if files.iter().any(|file| file == SETTINGS_FILE) {
-            // The output of a run, which may lie below its input.
+        if files.iter().any(|file| file == SETTINGS_FILE) && is_output(place, &folder).await? {
             continue;
         }
         let is_sweep = |name: &String| ENDINGS.iter().any(|end| name.ends_with(end));
@@ -61,29 +67,21 @@ pub(super) async fn drives(place: &Place, dataset: Dataset) -> Result<Vec<Drive>
         }
         if depth < MAX_DEPTH {
             // Taken from the end, so the first comes last.
-            let below = folders
+            let folders = folders
                 .into_iter()
                 .rev()
                 .filter(|name| !name.starts_with('_') && name != LOST);
-            let path = |name: String| match folder.is_empty() {
-                true => name,
-                false => format!("{folder}/{name}"),
-            };
-            waiting.extend(below.map(|name| (path(name), depth + 1)));
+            waiting.extend(folders.map(|name| (below(&folder, &name), depth + 1)));
         }
     }
     Ok(drives)
 }
 
 async fn drive(place: &Place, folder: &str, files: &[String]) -> Result<Drive, DatasetError> {
-    let path = |file: &str| match folder.is_empty() {
-        true => file.to_owned(),
-        false => format!("{folder}/{file}"),
-    };
     let mut sweeps: Vec<DriveSweep> = files
         .iter()
         .map(|file| DriveSweep {
-            uri: place.uri(&path(file)),
+            uri: place.uri(&below(folder, file)),
             key: key_of(stem(file)),
             pose: None,
             time_s: None,
@@ -94,7 +92,8 @@ async fn drive(place: &Place, folder: &str, files: &[String]) -> Result<Drive, D
         let file = format!("{log}city_SE3_egovehicle.feather");
         match place.read(&file).await {
             Err(PlaceError::Missing(_)) => {}
-            Err(error) => return Err(error.into()),
+            Err(error) if error.may_pass() => return Err(error.into()),
+            Err(error) => bad_poses = Some(error.to_string()),
             Ok(bytes) => {
                 let names: Vec<&str> = files.iter().map(String::as_str).collect();
                 match read_poses(&bytes, &names) {

@@ -99,8 +99,12 @@ fn take(
             }
             let numbers = |list: arrow_array::ArrayRef| -> Result<String, ManifestError> {
                 let values = list.as_primitive_opt::<arrow_array::types::Float64Type>();
-                let values = values.ok_or_else(other)?.values();
-                Ok(serde_json::to_string(&values[..]).unwrap_or_default())
+                let values = values.ok_or_else(other)?;
+                if arrow_array::Array::null_count(values) > 0 {
+                    let text = format!("row {}: a number of {name} is missing", first + row);
+                    return Err(ManifestError::Unreadable(text));
+                }
+                Ok(serde_json::to_string(&values.values()[..]).unwrap_or_default())
             };
             let text = match field.data_type() {
                 Type::Utf8 => column.as_string::<i32>().value(row).to_owned(),
