@@ -14,7 +14,7 @@ use crate::flow::field::{Backend, BackendError};
 use crate::flow::{
     self, Control, Ego, Estimate, FlowError, Point, RigidTransform, Sequence, Sweep,
 };
-use crate::formats::{self, PointTimes, SweepClock, TimedCloud, pair_interval_s};
+use crate::formats::{self, PointTimes, SweepClock, TimedCloud, pair_interval_s, sweep_time_s};
 use crate::job::{
     DeviceChoice, EgoChoice, FieldChoices, GroundChoice, JobOptions, PrecisionChoice, PresetChoice,
 };
@@ -318,7 +318,8 @@ impl Surroundings {
     }
 
     /// The solver's options for the pair of two sweeps, given by their indices. The larger sweep
-    /// has `points` points. Where poses are given, they determine the ego motion.
+    /// has `points` points. Where poses are given, they determine the ego motion. A given ego motion
+    /// is that from the sweep with the lower index to the other.
     pub(super) fn options(
         &self,
         options: &JobOptions,
@@ -330,6 +331,10 @@ impl Surroundings {
         options.newest_first = self.interval_s(pair).is_some_and(f32::is_sign_negative);
         if let Some(poses) = &self.poses {
             options.ego = Ego::Given(poses[target].inv_mul(&poses[source]));
+        } else if source > target
+            && let Ego::Given(motion) = &mut options.ego
+        {
+            *motion = motion.inverse();
         }
         options
     }
@@ -342,6 +347,7 @@ impl Surroundings {
             ground: self.ground(index, &points),
             points,
             times: None,
+            time_s: sweep_time_s(&path.to_string_lossy(), None),
         })
     }
 
@@ -355,14 +361,16 @@ impl Surroundings {
         if let Some(refused) = refused_times {
             complain(format_args!("warning: {}: {refused}", path.display()));
         }
+        let clock = times.as_ref().map(PointTimes::clock);
         let known = index.checked_sub(self.forgotten);
         if let Some(sweep) = known.and_then(|index| self.known.get_mut(index)) {
-            sweep.clock = times.as_ref().map(PointTimes::clock);
+            sweep.clock = clock;
         }
         Ok(Sweep {
             ground: self.ground(index, &cloud.points),
             points: cloud.points,
             times: times.map(|times| times.offsets_s),
+            time_s: sweep_time_s(&path.to_string_lossy(), clock),
         })
     }
 

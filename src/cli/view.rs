@@ -83,6 +83,12 @@ impl View {
         if let [file] = self.files.as_slice() {
             let bytes = files::read_bytes(file)?;
             if is_dense(&bytes) {
+                let files = self.estimation.files();
+                if !self.flow.is_empty() || self.tracks.is_some() || !files.is_empty() {
+                    let text =
+                        "a dense cloud is shown alone: leave out --flow, --tracks and --poses";
+                    return Err(Failure::usage(anyhow!(text)));
+                }
                 return Ok(LocalScene {
                     name,
                     dense: Some(bytes.into()),
@@ -110,7 +116,7 @@ impl View {
         let sweep = |points: Vec<Point>, ground: Option<Vec<bool>>| Sweep {
             points,
             ground,
-            times: None,
+            ..Sweep::default()
         };
         let is_both = match self.files.as_slice() {
             [file] => is_pair(&files::read_bytes(file)?),

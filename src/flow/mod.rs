@@ -78,7 +78,7 @@ pub use objects::{
 pub use options::*;
 pub use problem::{NeighborSweep, Problem};
 pub use registration::Registration;
-pub use sequence::{Sequence, Sweep, WindowedPair, is_window_final, window};
+pub use sequence::{Sequence, Sweep, WindowedPair, is_window_final, neighbor_at, window};
 
 #[cfg(feature = "service")]
 pub(crate) use data::{largest, locked};

@@ -28,6 +28,9 @@ pub struct Sweep {
     pub ground: Option<Vec<bool>>,
     /// N times of the points, see [`Problem::times`]. None where they are unknown.
     pub times: Option<Vec<f32>>,
+    /// Time of the sweep, seconds, on any clock of the sequence. It tells how many intervals lie
+    /// between the sweeps of a window. None where it is unknown: they count as evenly spaced.
+    pub time_s: Option<f64>,
 }
 
 impl Sweep {
@@ -87,6 +90,7 @@ impl Sweep {
             points: rows.iter().map(|&row| self.points[row]).collect(),
             ground: self.ground.map(kept),
             times: self.times.map(measured),
+            time_s: self.time_s,
         }
     }
 }
@@ -165,9 +169,10 @@ impl WindowedPair<'_> {
         let others = others.filter(|&index| index != self.pair && index != self.pair + 1);
         let neighbors: Vec<NeighborSweep> = others
             .filter_map(|index| {
-                // Sweeps more than 127 intervals away are skipped.
-                let at = i8::try_from(index as i64 - self.pair as i64).ok()?;
-                Some(sweep(index)?.as_neighbor(at))
+                let neighbor = sweep(index)?;
+                let times = [source, target, neighbor].map(|sweep| sweep.time_s);
+                let at = neighbor_at(times, index as i64 - self.pair as i64)?;
+                Some(neighbor.as_neighbor(at))
             })
             .collect();
         let problem = Problem {
@@ -180,6 +185,25 @@ impl WindowedPair<'_> {
         };
         estimate(backend, &problem, options, control)
     }
+}
+
+/// The place of a neighbor sweep, [`NeighborSweep::at`]. `times_s` are the times of the source, of the
+/// target and of the sweep, seconds. Where one is unknown, the sweep counts as `sweeps` intervals after
+/// the source. None if it lies between two intervals of the pair, where the motion of the pair does not
+/// tell where an object is, if it has the time of one of the pair, or if it is more than 127 intervals away.
+pub fn neighbor_at(times_s: [Option<f64>; 3], sweeps: i64) -> Option<i8> {
+    /// Difference from a whole number of intervals.
+    const OFF: f64 = 0.2;
+    let [Some(source), Some(target), Some(sweep)] = times_s else {
+        return i8::try_from(sweeps).ok();
+    };
+    let intervals = (sweep - source) / (target - source);
+    if !intervals.is_finite() {
+        return i8::try_from(sweeps).ok();
+    }
+    let at = intervals.round();
+    let is_near = (intervals - at).abs() <= OFF;
+    (is_near && at != 0.0 && at != 1.0 && at.abs() <= 127.0).then_some(at as i8)
 }
 
 /// A sweep, and the options of the pair that has it as its target.
@@ -358,6 +382,25 @@ impl Sequence {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_neighbor_sweep_counts_by_its_time_where_sweeps_are_missing() {
+        // The sweep at 0.2 s is missing.
+        let of = |[source, target]: [f64; 2], other: f64| {
+            neighbor_at([Some(source), Some(target), Some(other)], 9)
+        };
+        assert_eq!(of([0.3, 0.4], 0.1), Some(-2));
+        assert_eq!(of([0.3, 0.4], 0.503), Some(2));
+        assert_eq!(of([0.1, 0.3], 0.5), Some(2));
+        assert_eq!(of([0.1, 0.3], 0.4), None);
+        assert_eq!(of([0.1, 0.3], 0.31), None);
+        assert_eq!(of([0.1, 0.2], 99.0), None);
+        // The newer sweep first.
+        assert_eq!(of([0.4, 0.3], 0.1), Some(3));
+        assert_eq!(of([0.1, 0.1], 0.3), Some(9));
+        assert_eq!(neighbor_at([Some(0.0), None, Some(1.0)], -2), Some(-2));
+        assert_eq!(neighbor_at([None; 3], 128), None);
+    }
 
     #[test]
     fn a_window_holds_its_pair_and_is_as_centered_as_the_ends_allow() {

@@ -65,6 +65,13 @@ pub fn pair_interval_s(names: [&str; 2], clocks: [Option<SweepClock>; 2]) -> Opt
         })
 }
 
+/// Time of a sweep, seconds: that in its `name`, else that of its sensor's clock. None if neither is
+/// known.
+pub fn sweep_time_s(name: &str, clock: Option<SweepClock>) -> Option<f64> {
+    let by_name = SweepTime::from_name(name).and_then(SweepTime::seconds);
+    by_name.or_else(|| clock?.sweep_s)
+}
+
 impl SweepTime {
     /// The time in a file name or path; none if it holds no timestamp.
     ///
@@ -104,6 +111,11 @@ impl SweepTime {
     /// The time in nanoseconds. None if 64 bits do not hold it.
     pub fn nanoseconds(self) -> Option<u64> {
         self.ticks.checked_mul(self.unit.nanoseconds())
+    }
+
+    /// The time in seconds. None if 64 bits do not hold its nanoseconds.
+    pub fn seconds(self) -> Option<f64> {
+        Some(self.nanoseconds()? as f64 * 1e-9)
     }
 
     /// Seconds from this sweep to another, below zero where the other is the earlier one. None if the

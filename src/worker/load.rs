@@ -14,7 +14,8 @@ use super::control::JobControl;
 use super::run::Worker;
 use crate::clock::Timestamp;
 use crate::engine::Work;
-use crate::flow::{Ego, EnvelopeError, MotionField, Snapshot, Sweep};
+use crate::flow::{Ego, EnvelopeError, MotionField, Snapshot, Sweep, neighbor_at};
+use crate::formats::SweepTime;
 use crate::job::{Job, JobOptions, State};
 use crate::payload::{CorruptPayload, StoredCloud};
 use crate::queue::{Lease, QueueError};
@@ -53,10 +54,10 @@ impl Worker {
             async { Ok(self.blobs.get(owner, Blob::Sweep(target)).await?) },
             self.field_before(job),
         )?;
-        let neighbors = self.around(job).await?;
         let snapshot = self.earlier_snapshot(job).await;
         let source = StoredCloud::from_bytes(&source)?;
         let target = StoredCloud::from_bytes(&target)?;
+        let neighbors = self.around(job, [source.time, target.time]).await?;
         options.dt_s = options
             .dt_s
             .or_else(|| Some(source.time?.interval_s(target.time?)?.abs()));
@@ -97,18 +98,31 @@ impl Worker {
     }
 
     /// The neighbor sweeps of a pair, each with its time after the source in units of the interval
-    /// from source to target. For a backward pair, earlier sweeps have positive times.
-    async fn around(&self, job: &Job) -> Result<Vec<(Sweep, i8)>, StoreError> {
+    /// from source to target. For a backward pair, earlier sweeps have positive times. `times` are those
+    /// of the source and the target.
+    async fn around(
+        &self,
+        job: &Job,
+        times: [Option<SweepTime>; 2],
+    ) -> Result<Vec<(Sweep, i8)>, StoreError> {
         let (owner, pair) = job.sweeps();
         let [first, end] = job.window;
         let mut around = Vec::new();
         for index in (first..end).filter(|index| !pair.contains(index)) {
             let gaps = i64::from(index) - i64::from(pair[0]);
             let at = if job.backward { -gaps } else { gaps };
-            // Sweeps farther away are of no use.
-            let Ok(at) = i8::try_from(at) else { continue };
             let bytes = self.blobs.get(owner, Blob::Sweep(index)).await?;
-            let StoredCloud { points, ground, .. } = StoredCloud::from_bytes(&bytes)?;
+            let StoredCloud {
+                points,
+                ground,
+                time,
+                ..
+            } = StoredCloud::from_bytes(&bytes)?;
+            let [source, target] = times;
+            let times = [source, target, time].map(|time| time?.seconds());
+            let Some(at) = neighbor_at(times, at) else {
+                continue;
+            };
             let sweep = Sweep {
                 points,
                 ground,

@@ -226,6 +226,27 @@ fn a_dense_cloud_keeps_the_intensities_of_its_sweeps() {
 }
 
 #[test]
+fn a_given_ego_motion_of_two_sweeps_leads_a_dense_cloud_back_as_well() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    assert_eq!(fnsf(folder, &["synth", "-o", "."]).code, 0);
+    let dense = |options: &[&str]| {
+        let sweeps = ["densify", "sweep_0000.pcd", "sweep_0001.pcd"];
+        let output = ["--reference-time", "0", "-o", "dense.ply"];
+        let done = fnsf(folder, &[&sweeps[..], &output, options].concat());
+        assert_eq!(done.code, 0, "{}", done.stderr);
+        let bytes = std::fs::read(folder.join("dense.ply")).expect("written");
+        read_cloud(&bytes, None).expect("a cloud").points
+    };
+    let (found, given) = (dense(&[]), dense(&["--ego", "pair_0000.npz"]));
+    assert_eq!(found.len(), given.len());
+    let off = |(a, b): (&Point, &Point)| f64::from((a[0] - b[0]).hypot(a[1] - b[1]));
+    let off = found.iter().zip(&given).map(off).sum::<f64>() / found.len() as f64;
+    // The sensor moves by a metre.
+    assert!(off < 0.1, "{off}");
+}
+
+#[test]
 fn what_no_sequence_can_be_asked_is_refused_with_advice() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
@@ -387,6 +408,18 @@ fn a_pair_with_the_newer_sweep_first_is_deskewed_against_the_direction_of_time()
     let report = json(folder, &["flow", later, earlier, "--json"]);
     assert_eq!(report["dt_s"], 0.1, "{report}");
     assert_eq!(report["deskew"]["applied"], true, "{report}");
+    // A label does the same, and its report says so.
+    let manifest = format!("source,target\n{later},{earlier}\n");
+    std::fs::write(folder.join("pairs.csv"), manifest).expect("written");
+    for end in [&["--preset", "default"][..], &["--finalize"]] {
+        let done = fnsf(
+            folder,
+            &[&["label", "pairs.csv", "-o", "labels"], end].concat(),
+        );
+        assert_eq!(done.code, 0, "{}", done.stderr);
+    }
+    let table = std::fs::read_to_string(folder.join("labels/_report.csv")).expect("written");
+    assert!(table.contains(",true,0"), "{table}");
     // Without timestamps in the names the first sweep counts as the earlier one.
     let unnamed = ["street/sweep_0001.pcd", "street/sweep_0000.pcd"];
     let report = json(folder, &["flow", unnamed[0], unnamed[1], "--json"]);

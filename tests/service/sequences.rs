@@ -97,7 +97,7 @@ fn dense(options: &str) -> DenseCloud {
         .map(|points| Sweep {
             points: points.clone(),
             ground: finds_ground.then(|| segment(points, &GroundOptions::default()).ground),
-            times: None,
+            ..Sweep::default()
         })
         .collect();
     let plan = asked.plan(sweeps.len()).expect("a plan");

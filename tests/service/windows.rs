@@ -7,8 +7,9 @@ use std::sync::OnceLock;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::simulate::{Street, StreetOptions};
 use fnsf::flow::{Point, Preset, Sequence, Sweep, Uncontrolled};
-use fnsf::formats::CloudFormat;
+use fnsf::formats::{CloudFormat, read_flow};
 use fnsf::payload::points_from_le_bytes;
+use reqwest::multipart::{Form, Part};
 use tokio_stream::StreamExt;
 
 use crate::clouds::file;
@@ -131,6 +132,44 @@ async fn pairs_that_see_the_sweeps_around_them_have_the_same_bits_through_every_
     }
     let streamed: Vec<Vec<Point>> = streamed.into_iter().map(|(_, flow)| flow).collect();
     assert!(streamed == expected, "as a stream");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn windows_with_a_missing_sweep_have_the_same_bits_in_the_service_and_on_the_command_line() {
+    let server = Server::start(&[]);
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut form = Form::new().text("options", r#"{"preset": "label"}"#);
+    let (mut names, mut kept) = (Vec::new(), Vec::new());
+    for (index, points) in sweeps().iter().enumerate().filter(|(index, _)| *index != 2) {
+        let name = format!("{}.npy", 1_700_000_000_000 + 100 * index);
+        let bytes = file(CloudFormat::Npy, points);
+        std::fs::write(folder.path().join(&name), &bytes).expect("written");
+        form = form.part("sweep", Part::bytes(bytes).file_name(name.clone()));
+        names.push(name);
+        kept.push(points.clone());
+    }
+    let (_, job) = post(&server, "/v1/sequences", form).await;
+    let job = ended(&server, job["id"].as_str().expect("a name")).await;
+    assert_eq!(job["state"], "succeeded", "{job}");
+    let found = pair_flows(&server, &job).await;
+    let done = Command::new(env!("CARGO_BIN_EXE_fnsf"))
+        .current_dir(folder.path())
+        .arg("flow")
+        .args(&names)
+        .args(["--preset", "label", "--device", "cpu", "-o", "flow.npz"])
+        .output();
+    let done = done.expect("the program starts");
+    assert!(done.status.success(), "{done:?}");
+    for (pair, found) in found.iter().enumerate() {
+        let path = folder.path().join(format!("flow_{pair:04}.npz"));
+        let bytes = std::fs::read(path).expect("written");
+        assert!(
+            *found == read_flow(&bytes, None).expect("a flow").flow,
+            "pair {pair}"
+        );
+    }
+    // By their indices the neighbors would be elsewhere.
+    assert!(found != flows(Preset::Label, &kept));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

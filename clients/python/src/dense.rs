@@ -96,7 +96,7 @@ pub(crate) fn densify<'py>(
         Ok(Sweep {
             ground: mask.transpose()?,
             points,
-            times: None,
+            ..Sweep::default()
         })
     });
     let taken: Vec<Sweep> = taken.collect::<PyResult<_>>()?;

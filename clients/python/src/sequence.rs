@@ -29,6 +29,8 @@ struct State {
     sequence: flow::Sequence,
     waiting: VecDeque<Waiting>,
     last: Option<(Arc<[Point]>, Option<SweepClock>)>,
+    /// Time of the last sweep after the first, seconds, by the intervals of the pairs.
+    time_s: f64,
     tracker: Option<Tracker>,
     /// Whether estimates were lost by an exception after they were made.
     is_cut: bool,
@@ -120,6 +122,7 @@ impl Sequence {
             sequence: flow::Sequence::default(),
             waiting: VecDeque::new(),
             last: None,
+            time_s: 0.0,
             tracker: track.then(Tracker::default),
             is_cut: false,
             process: std::process::id(),
@@ -152,10 +155,11 @@ impl Sequence {
         let count = cloud.len();
         let mask = mask.map(|mask| column("the ground mask", &mask, count));
         let times = times.map(|times| column("times", &times, count));
-        let sweep = Sweep {
+        let mut sweep = Sweep {
             points: cloud.to_vec(),
             ground: mask.transpose()?,
             times: times.transpose()?,
+            time_s: None,
         };
         let clock = sweep
             .times
@@ -172,9 +176,15 @@ impl Sequence {
         if let Some(ego) = ego {
             solver.ego = Ego::Given(motion("ego", &ego)?);
         }
+        let time_s = match state.last {
+            Some(_) => state.time_s + f64::from(solver.dt_s),
+            None => 0.0,
+        };
+        sweep.time_s = Some(time_s);
         let estimates = state.run(py, &watch, progress.as_ref(), |sequence, backend| {
             sequence.push(backend, sweep.clone(), &solver, &watch)
         })?;
+        state.time_s = time_s;
         if let Some((last, _)) = state.last.replace((Arc::clone(&cloud), clock)) {
             let sweeps = [last, cloud];
             state.waiting.push_back(Waiting { sweeps, options });

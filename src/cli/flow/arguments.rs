@@ -35,6 +35,7 @@ pub(in crate::cli) struct Flow {
     #[arg(required_unless_present = "follow", value_name = "SWEEP")]
     pub(super) sweeps: Vec<PathBuf>,
     /// File for the flow. Its ending gives the format: .npz, .npy, .feather, .ply, .pcd or .json.
+    /// Missing folders are created.
     /// With more than two sweeps the files are numbered: flow.npz becomes flow_0000.npz,
     /// flow_0001.npz, ...
     #[arg(short, long, value_name = "OUT")]
@@ -126,6 +127,14 @@ impl Flow {
             && picture.extension().is_none_or(|ending| ending != "png")
         {
             return Err(Failure::usage(anyhow!("a picture's name ends in .png")));
+        }
+        if let Some(folder) = self.follow.follow.as_deref()
+            && !folder.is_dir()
+        {
+            return Err(Failure::bad_input(anyhow!(
+                "{} is no folder",
+                folder.display()
+            )));
         }
         let named = [&self.output, &self.picture].into_iter().flatten();
         if let Some(folder) = &self.follow.follow

@@ -49,7 +49,7 @@ impl Flow {
                     let sweep = Sweep {
                         points,
                         ground,
-                        times: None,
+                        ..Sweep::default()
                     };
                     pairs.push(&Arc::new(sweep), Taken::default())?;
                 }
