@@ -2,7 +2,7 @@
 
 use std::cell::LazyCell;
 
-use super::ego_motion::{ego_motion, prior};
+use super::ego_motion::{ego_motion, has_time_for_all, prior};
 use super::method::{Input, Solved};
 use super::result::{FieldSolution, Solution};
 use crate::flow::data::{Hash, Point};
@@ -38,18 +38,25 @@ pub(super) fn residual_motion(
     let state = snapshot
         .map(|snapshot| snapshot.state_for(*identity))
         .transpose()?;
-    let [source, target] = [&selection.source, &selection.target].map(|cloud| options.seen(cloud));
-    let prepared = field::prepare_target(backend, [&source, &target], options, control)?;
+    let host = backend.host();
     let prior = prior(problem, input.options);
-    let ego = match (&prepared, input.options.ego) {
-        (Some(prepared), ego) => {
-            let host = backend.host();
-            ego_motion(host, selection, ego, &prior, prepared.whole, control)
-        }
-        (None, Ego::Given(motion)) => Some(Registration::given(motion)),
-        (None, Ego::Auto | Ego::Off) => None,
+    let registered = |whole| ego_motion(host, selection, input.options.ego, &prior, whole, control);
+    // A cycle leads back to the source as it is aligned.
+    let early = options
+        .has_cycle()
+        .then(|| input.align(host, registered(has_time_for_all(selection, control))));
+    let early = early.transpose()?;
+    let source = early
+        .as_ref()
+        .map_or(&selection.source, |early| &early.aligned);
+    let [source, target] = [source, &selection.target].map(|cloud| options.seen(cloud));
+    let prepared = field::prepare_target(backend, [&source, &target], options, control)?;
+    let alignment = match (early, &prepared, input.options.ego) {
+        (Some(early), ..) => early,
+        (None, Some(prepared), _) => input.align(host, registered(prepared.whole))?,
+        (None, None, Ego::Given(motion)) => input.align(host, Some(Registration::given(motion)))?,
+        (None, None, Ego::Auto | Ego::Off) => input.align(host, None)?,
     };
-    let alignment = input.align(backend.host(), ego)?;
     let ego = alignment.ego;
     let aligned = &alignment.aligned;
     let fitted = match &prepared {

@@ -1,5 +1,6 @@
 //! Tests of the estimate: masks, ground, deadlines, cancellation and a given ego motion.
 
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use super::ego_motion::prior;
@@ -8,9 +9,9 @@ use crate::flow::cpu::CpuBackend;
 use crate::flow::data::Control;
 use crate::flow::data::Interrupt;
 use crate::flow::data::StopReason;
-use crate::flow::data::transform_point;
 use crate::flow::data::{Point, Random, RigidTransform};
 use crate::flow::data::{Progress, Uncontrolled};
+use crate::flow::data::{transform_point, transform_points};
 use crate::flow::error::FlowError;
 use crate::flow::field::{Backend, BackendError, Network, PreparedTarget};
 use crate::flow::host::Host;
@@ -222,6 +223,62 @@ fn a_finer_transform_that_the_device_cannot_hold_leaves_the_coarse_one() {
     );
     assert!(estimate.fit().expect("a fit").iterations > 0);
     assert!(estimate.flow.iter().flatten().all(|f| f.is_finite()));
+}
+
+/// A device that keeps the source that a target is prepared for.
+struct Watched {
+    cpu: CpuBackend,
+    source: Mutex<Vec<Point>>,
+}
+
+impl Backend for Watched {
+    fn name(&self) -> String {
+        self.cpu.name()
+    }
+
+    fn host(&self) -> &Host {
+        self.cpu.host()
+    }
+
+    fn prepare_target(
+        &self,
+        source: &[Point],
+        target: &[Point],
+        options: &LossOptions,
+        control: &dyn Control,
+    ) -> Result<Box<dyn PreparedTarget>, BackendError> {
+        *self.source.lock().expect("no panic") = source.to_vec();
+        self.cpu.prepare_target(source, target, options, control)
+    }
+
+    fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError> {
+        self.cpu.evaluate(network, points)
+    }
+}
+
+#[test]
+fn a_cycle_is_prepared_for_the_source_in_the_frame_of_the_target() {
+    let pair = street();
+    let motion = pair.target_from_source;
+    for cycle in [false, true] {
+        let mut options = Preset::Neural.options(None);
+        (options.ground, options.ego) = (Ground::Keep, Ego::Given(motion));
+        let field = options.field_mut().expect("a field");
+        field.max_iterations = 0;
+        field.network_mut().expect("a network").cycle = cycle;
+        let backend = Watched {
+            cpu: CpuBackend::new(Some(2)).expect("threads"),
+            source: Mutex::default(),
+        };
+        let problem = Problem::pair(&pair.source, &pair.target);
+        estimate(&backend, &problem, &options, &Uncontrolled).expect("a flow");
+        let expected = match cycle {
+            true => transform_points(&motion, &pair.source),
+            false => pair.source.clone(),
+        };
+        let source = backend.source.into_inner().expect("no panic");
+        assert!(source == expected, "cycle {cycle}");
+    }
 }
 
 #[test]

@@ -103,9 +103,10 @@ pub trait PreparedTarget: Send {
     /// [`BackendError::Device`] if a GPU has no memory for the points or fails. A CPU never fails.
     fn distances(&self, points: &[Point]) -> Result<Vec<f32>, BackendError>;
 
-    /// Prepares the way back of a cycle, from the target to `source` (N x 3, metres): builds the
-    /// distance transform of the source, with the cells of the target's. A fit with the cycle of NSFP
-    /// to a distance transform needs it before [`Self::start`]. Checks `control` before each part.
+    /// Prepares the way back of a cycle, from the target to `source` (N x 3, metres), which is the
+    /// source of [`Self::start`]: builds the distance transform of the source, with the cells of the
+    /// target's. A fit with the cycle of NSFP to a distance transform needs it. Checks `control` before
+    /// each part.
     ///
     /// # Errors
     /// As [`Backend::prepare_target`].
