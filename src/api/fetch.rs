@@ -2,7 +2,12 @@
 //!
 //! Independent of HTTP and gRPC types.
 
+use std::future::Future;
+use std::time::Duration;
+
 use futures_util::StreamExt;
+use tokio::time::timeout;
+use url::{Position, Url};
 
 use super::codec;
 use super::error::ApiError;
@@ -10,14 +15,25 @@ use super::service::Service;
 use super::upload_budget::UploadReservation;
 use crate::payload::StoredCloud;
 
+/// Waits for a source, within the time limits of a body.
+async fn wait<T>(
+    room: &mut UploadReservation,
+    part: &str,
+    more: impl Future<Output = T>,
+) -> Result<T, ApiError> {
+    let text = || format!("{part}: the file cannot be fetched: its source is too slow");
+    let came = room.wait(more).await;
+    came.map_err(|_| ApiError::SourceUnavailable(text()))
+}
+
 impl Service {
     /// Fetches the file that the part `part` names. It counts as if it were sent in its place. Returns
     /// the name of the file and its content.
     ///
     /// # Errors
     /// [`ApiError::BadRequest`], [`ApiError::BadInput`] or [`ApiError::SourceUnavailable`] for a file that
-    /// is not allowed, not there or not to be had, or the errors of [`UploadReservation::take`] and
-    /// [`UploadReservation::wait`].
+    /// is not allowed, not there or not to be had in time, [`ApiError::ServerFull`] where too many are
+    /// being fetched, or the errors of [`UploadReservation::take`].
     pub(super) async fn fetch(
         &self,
         room: &mut UploadReservation,
@@ -26,11 +42,18 @@ impl Service {
     ) -> Result<(String, Vec<u8>), ApiError> {
         let refused = |error| ApiError::source(part, &error);
         let tenant = room.tenant().clone();
-        let _turn = self.fetches.wait(&tenant).await;
-        let opened = room.wait(self.remotes.sources.open(uri)).await?;
+        let source = Url::parse(uri).map(|url| url[..Position::BeforePath].to_owned());
+        let of_source = (tenant.clone(), source.unwrap_or_default());
+        let turns = async {
+            let of_source = self.sources.wait(&of_source).await;
+            (of_source, self.fetches.wait(&tenant).await)
+        };
+        let turns = timeout(self.limits.body_idle, turns).await;
+        let _turns = turns.map_err(|_| ApiError::ServerFull(Duration::from_secs(1)))?;
+        let opened = wait(room, part, self.remotes.sources.open(uri)).await?;
         let mut download = opened.map_err(refused)?;
         let mut bytes = Vec::new();
-        while let Some(piece) = room.wait(download.pieces.next()).await? {
+        while let Some(piece) = wait(room, part, download.pieces.next()).await? {
             let piece = piece.map_err(refused)?;
             room.take(piece.len())?;
             append(&mut bytes, &piece);
@@ -59,7 +82,6 @@ impl Service {
         let decode = move || {
             // A small compressed file may decode to a large cloud.
             let memory = codec::decoding_memory(&part, &bytes, name.as_deref(), most)?;
-            room.check(memory.clouds.saturating_add(memory.meanwhile))?;
             room.hold(memory.clouds)?;
             let mut meanwhile = room.another();
             meanwhile.hold(memory.meanwhile)?;

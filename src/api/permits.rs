@@ -1,6 +1,7 @@
 //! Fair permits for scarce resources, shared by tenants.
 
 use std::collections::HashMap;
+use std::hash::Hash;
 use std::sync::{Arc, Mutex, MutexGuard, Weak};
 use std::time::Duration;
 
@@ -10,27 +11,28 @@ use super::error::ApiError;
 use crate::job::Tenant;
 use crate::sync::locked;
 
-/// A waiting line for permits. Each tenant can have only a bounded number of its requests in the
-/// shared line, so a tenant with many requests does not delay the others by all of them.
-pub(super) struct FairQueue {
+/// A waiting line for permits. Each key, which is a tenant if nothing else is said, can have only a
+/// bounded number of its requests in the shared line. So a tenant with many requests does not delay the
+/// others by all of them.
+pub(super) struct FairQueue<K = Tenant> {
     each: usize,
     all: Arc<Semaphore>,
-    own: Mutex<HashMap<Tenant, Weak<Semaphore>>>,
+    own: Mutex<HashMap<K, Weak<Semaphore>>>,
 }
 
-impl FairQueue {
+impl<K: Clone + Eq + Hash> FairQueue<K> {
     /// `turns` permits. Each tenant may have up to `each` requests that hold one or are in the shared
     /// line. Where a permit is held for long, that is fewer than there are permits.
     pub(super) fn new(turns: usize, each: usize) -> Self {
         Self {
             each,
-            all: Arc::new(Semaphore::new(turns)),
+            all: Arc::new(Semaphore::new(turns.min(Semaphore::MAX_PERMITS))),
             own: Mutex::default(),
         }
     }
 
     /// Waits for a permit for the tenant. The permit is held until the returned value is dropped.
-    pub(super) async fn wait(&self, tenant: &Tenant) -> Option<[OwnedSemaphorePermit; 2]> {
+    pub(super) async fn wait(&self, tenant: &K) -> Option<[OwnedSemaphorePermit; 2]> {
         let own = {
             let mut own = locked(&self.own);
             own.retain(|_, line| line.strong_count() > 0);

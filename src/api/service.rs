@@ -32,6 +32,9 @@ const MAX_ARCHIVES: usize = 16;
 /// Maximum number of sweeps that are fetched by URI at a time.
 const MAX_FETCHES: usize = 32;
 
+/// Those of them that a tenant has fetched from one host or bucket.
+const MAX_OF_SOURCE: usize = 8;
+
 /// Maximum number of reads of many rows of the queue at a time: as many as its engines read on for all others too.
 const MAX_SCANS: usize = 2;
 
@@ -66,6 +69,9 @@ pub struct Service {
     pub(super) scans: FairQueue,
     /// Permits for sweeps that are fetched by URI.
     pub(super) fetches: FairQueue,
+    /// Permits for the sweeps that a tenant has fetched from one host or bucket, so that a slow one does
+    /// not take those of all others.
+    pub(super) sources: FairQueue<(Tenant, String)>,
     /// Whether the server is ready, as `/readyz` says. The gRPC health service follows it.
     pub(super) ready: watch::Sender<bool>,
     draining: AtomicBool,
@@ -143,6 +149,7 @@ impl Service {
                     MAX_FETCHES
                 },
             ),
+            sources: FairQueue::new(usize::MAX, MAX_OF_SOURCE),
             ready: watch::Sender::new(false),
             draining: AtomicBool::new(false),
             closing: CancellationToken::new(),

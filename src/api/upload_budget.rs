@@ -97,6 +97,7 @@ impl UploadBudget {
             uploads: Arc::clone(self),
             tenant: tenant.clone(),
             held: None,
+            of_request: Arc::default(),
             bytes: 0,
             began: None,
             credit: self.limits.idle,
@@ -141,6 +142,8 @@ pub(super) struct UploadReservation {
     uploads: Arc<UploadBudget>,
     tenant: Tenant,
     held: Option<OwnedSemaphorePermit>,
+    /// Units of all reservations of the request.
+    of_request: Arc<AtomicU64>,
     bytes: u64,
     /// The time of the first byte.
     began: Option<Instant>,
@@ -152,7 +155,7 @@ impl UploadReservation {
     /// Moves this reservation out for a complete body, and leaves an empty one for the next body of
     /// the same tenant.
     pub(super) fn next(&mut self) -> Self {
-        let next = self.uploads.room(&self.tenant);
+        let next = self.another();
         std::mem::replace(self, next)
     }
 
@@ -161,16 +164,17 @@ impl UploadReservation {
         &self.tenant
     }
 
-    /// A second, empty reservation for the same tenant.
+    /// A second, empty reservation for the same request.
     pub(super) fn another(&self) -> Self {
-        self.uploads.room(&self.tenant)
+        let mut another = self.uploads.room(&self.tenant);
+        another.of_request = Arc::clone(&self.of_request);
+        another
     }
 
     /// Adds `bytes` received bytes to the reservation and to the time credit.
     ///
     /// # Errors
-    /// [`ApiError::TooLarge`] if the body exceeds its limit or the whole budget,
-    /// [`ApiError::ServerFull`] if the budget of all bodies or of the tenant is exhausted.
+    /// [`ApiError::TooLarge`] if the body exceeds its limit, or those of [`UploadReservation::hold`].
     pub(super) fn take(&mut self, bytes: usize) -> Result<(), ApiError> {
         let limits = self.uploads.limits;
         self.bytes += bytes as u64;
@@ -187,18 +191,17 @@ impl UploadReservation {
         self.hold(self.bytes)
     }
 
-    /// Checks that `bytes` bytes are there when nothing else is held.
-    ///
-    /// # Errors
-    /// [`ApiError::TooLarge`].
-    pub(super) fn check(&self, bytes: u64) -> Result<(), ApiError> {
+    /// Checks that the request may hold `more` units in addition to what it holds.
+    fn check(&self, more: u64) -> Result<(), ApiError> {
         let UploadLimits { all, tenant, .. } = self.uploads.limits;
         let most = all.min(tenant);
+        let bytes = (self.of_request.load(Ordering::Relaxed) + more) * UNIT;
         if bytes <= most {
             return Ok(());
         }
         Err(ApiError::TooLarge(format!(
-            "it takes {} MiB of memory, and this server has {} MiB for the uploads of a tenant",
+            "the request takes {} MiB of memory while it is read, and this server has {} MiB for the \
+             uploads of a tenant (max_total_upload_mib)",
             bytes.div_ceil(1 << 20),
             most >> 20
         )))
@@ -207,14 +210,14 @@ impl UploadReservation {
     /// Extends the reservation to `bytes` bytes: the body so far, or the size of the decoded cloud.
     ///
     /// # Errors
-    /// [`ApiError::TooLarge`] where the budget never has as much, [`ApiError::ServerFull`] where
-    /// others hold it.
+    /// [`ApiError::TooLarge`] where the budget never has as much for the request,
+    /// [`ApiError::ServerFull`] where others hold it.
     pub(super) fn hold(&mut self, bytes: u64) -> Result<(), ApiError> {
-        self.check(bytes)?;
         let limits = self.uploads.limits;
         // Rounded up for the total of the body, so that small chunks do not cost more than large
         // ones.
         let more = bytes.div_ceil(UNIT).saturating_sub(self.units());
+        self.check(more)?;
         let full = || ApiError::ServerFull(Duration::from_secs(1));
         {
             let mut held = locked(&self.uploads.held);
@@ -232,6 +235,7 @@ impl UploadReservation {
                 return Err(full());
             };
             *of_tenant += more;
+            self.of_request.fetch_add(more, Ordering::Relaxed);
             match &mut self.held {
                 Some(held) => held.merge(permit),
                 none => *none = Some(permit),
@@ -298,6 +302,7 @@ impl UploadReservation {
 impl Drop for UploadReservation {
     fn drop(&mut self) {
         let units = self.units();
+        self.of_request.fetch_sub(units, Ordering::Relaxed);
         let mut held = locked(&self.uploads.held);
         if let Some(of_tenant) = held.get_mut(&self.tenant) {
             *of_tenant = of_tenant.saturating_sub(units);
@@ -361,6 +366,23 @@ mod tests {
         drop(first);
         uploads.room(&tenant("a")).take(1 << 20).expect("room");
         assert_eq!(uploads.held.lock().expect("no panic").len(), 1);
+    }
+
+    #[test]
+    fn a_request_that_never_fits_is_too_large_and_one_that_others_keep_out_may_come_again() {
+        let uploads = uploads();
+        let mut body = uploads.room(&tenant("a"));
+        body.take(600 << 10).expect("room");
+        let mut cloud = body.another();
+        assert!(matches!(cloud.hold(600 << 10), Err(ApiError::TooLarge(_))));
+        let mut other = uploads.room(&tenant("a"));
+        let refused = other.hold(600 << 10);
+        assert!(matches!(refused, Err(ApiError::ServerFull(_))));
+        // A body that is kept belongs to its request, until it is dropped.
+        let kept = body.next();
+        assert!(matches!(cloud.hold(600 << 10), Err(ApiError::TooLarge(_))));
+        drop(kept);
+        cloud.hold(600 << 10).expect("room");
     }
 
     #[tokio::test]

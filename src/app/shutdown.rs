@@ -25,8 +25,8 @@ impl App {
     ///    until 1 s before the deadline. An object search is not interrupted, nor is a fit that its
     ///    deadline has shortened. A durable job that does not stop in time is queued again at the
     ///    next start.
-    /// 4. Where the queue is PostgreSQL, calls that wait for a job of another node have until 3 s
-    ///    before the deadline.
+    /// 4. Where the queue is PostgreSQL, calls may wait for jobs on other nodes until 3 s before the
+    ///    deadline.
     /// 5. Event streams and long polls end, and the listener closes. Open connections have 1 s to
     ///    send their responses, but not beyond the deadline.
     /// 6. Background tasks end, and the queue records the graceful shutdown, within 1 s after the

@@ -178,6 +178,46 @@ async fn a_server_of_files_may_fail_and_leads_nowhere_else() {
 }
 
 #[tokio::test]
+async fn a_source_that_stalls_is_named_and_does_not_hold_up_others() {
+    let bytes = file(CloudFormat::Npy, &small_pair()[0]);
+    let stalls = || async { std::future::pending::<Status>().await };
+    let serve = async |router: Router| {
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await;
+        let listener = listener.expect("a port");
+        let prefix = format!("http://{}/", listener.local_addr().expect("an address"));
+        tokio::spawn(async move { axum::serve(listener, router).await });
+        prefix
+    };
+    let slow = serve(Router::new().route("/a.npy", get(stalls))).await;
+    let good = serve(Router::new().route("/a.npy", get(move || async move { bytes }))).await;
+    let server = Server::with_config(&format!(
+        "[remote]\nsweeps = [\"{slow}\", \"{good}\"]\nallow_private_addresses = true\n\
+         [limits]\nbody_timeout_seconds = 3\n"
+    ));
+    let [slow, good] = [slow, good].map(|prefix| format!("{prefix}a.npy"));
+    // More than the turns of all sources.
+    let stalling = (0..40).map(|_| send(&server, "/v1/jobs", &slow, &slow));
+    let others = async {
+        tokio::time::sleep(std::time::Duration::from_secs(1)).await;
+        let began = std::time::Instant::now();
+        let (status, _) = send(&server, "/v1/jobs", &good, &good).await;
+        assert_eq!(status, StatusCode::ACCEPTED);
+        assert!(began.elapsed().as_secs() < 2, "{:?}", began.elapsed());
+    };
+    let (refused, ()) =
+        futures_util::future::join(futures_util::future::join_all(stalling), others).await;
+    let codes: std::collections::BTreeSet<String> = refused
+        .iter()
+        .map(|(_, body)| serde_json::from_slice(body).expect("JSON"))
+        .map(|problem: Value| problem["code"].as_str().unwrap_or_default().to_owned())
+        .collect();
+    assert!(
+        codes.iter().eq(["server_full", "source_unavailable"]),
+        "{codes:?}"
+    );
+}
+
+#[tokio::test]
 async fn sweeps_are_fetched_from_a_bucket() {
     let Some(objects) = ObjectServer::start() else {
         return;

@@ -24,7 +24,7 @@ const ROWS: usize = 1000;
 /// Receives the next message, within the time limits of a body.
 ///
 /// # Errors
-/// [`ApiError::TooSlow`], [`ApiError::TooLarge`] for a message above the size limit, or
+/// [`ApiError::TooSlow`], [`ApiError::TooLarge`] for a message above a size limit, or
 /// [`ApiError::BadRequest`] if the stream is broken.
 pub(super) async fn next<T>(
     room: &mut UploadReservation,
@@ -39,6 +39,7 @@ pub(super) fn broken(status: &Status) -> ApiError {
     match (status.code(), status::own_code(status)) {
         (_, Some("too_slow")) => ApiError::TooSlow,
         (_, Some("server_full")) => ApiError::ServerFull(Duration::from_secs(1)),
+        (_, Some("too_large")) => ApiError::TooLarge(status.message().to_owned()),
         (Code::OutOfRange, _) => {
             let text = "a message is larger than 1 MiB: send smaller chunks";
             ApiError::TooLarge(text.to_owned())

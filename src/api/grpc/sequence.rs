@@ -349,20 +349,20 @@ async fn send(
         target: pair.target.clone(),
         outcome: Some(outcome),
     };
+    // A server that stops waits for the calls that wait for a job, until they have their answer.
+    let mut awaited = None;
     let answer = match pair.job {
         Err(error) => Err(error),
         Ok(accepted) => match service.wait(accepted.job.id, None).await {
             Ok(Waited::Ended(job)) => {
-                if let Some(awaited) = accepted.awaited {
-                    awaited.disarm();
-                }
+                awaited = accepted.awaited;
                 service.answer(&job).await
             }
             Ok(Waited::StillOpen(_)) => Err(ApiError::Draining),
             Err(error) => Err(error),
         },
     };
-    match answer {
+    let sent = match answer {
         Err(error) => {
             service.count_late_error("grpc", &error);
             let failed = header(Outcome::Error(convert::pair_error(&error)));
@@ -374,5 +374,9 @@ async fn send(
             let messages = std::iter::once(Part::Pair(head)).chain(pieces).map(message);
             chunks::send(messages, answers, answer.room.taking()).await
         }
+    };
+    if let Some(awaited) = awaited {
+        awaited.disarm();
     }
+    sent
 }

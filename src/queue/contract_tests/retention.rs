@@ -1,6 +1,7 @@
 //! What ended jobs are kept for.
 
 use super::*;
+use crate::job::DeliveryState;
 use crate::queue::outgoing::Settled;
 
 pub(crate) async fn a_result_that_somebody_waits_to_read_is_kept(stand: &mut impl Stand) {
@@ -71,6 +72,7 @@ pub(crate) async fn a_pair_is_not_done_again_while_its_sequence_is_being_closed(
         &queue,
         Submission {
             finalizer_seconds: Some(1.0),
+            result_uri: Some("s3://a/dense.ply".to_owned()),
             ..sequence(2)
         },
     )
@@ -90,9 +92,23 @@ pub(crate) async fn a_pair_is_not_done_again_while_its_sequence_is_being_closed(
         Err(QueueError::NotTerminal(State::Running))
     );
     finish(&queue, &closing.job, done()).await;
+    let hold = Duration::from_secs(60);
+    let taken = queue.take_outgoing(10, hold).await.expect("taken");
+    let settled = taken.iter().map(|one| (one.number, Settled::Done));
+    queue.settle(settled.collect()).await.expect("settled");
+    let now = async || queue.job(&whole.tenant, whole.id).await.expect("known");
+    let delivery = |job: &Job| job.delivery.as_ref().map(|delivery| delivery.state);
+    let ended = now().await;
+    assert!(ended.report.is_some() && ended.stop_reason.is_some());
+    assert_eq!(delivery(&ended), Some(DeliveryState::Delivered));
     queue
         .requeue(pairs[0].id, true)
         .await
         .expect("it has ended");
+    // The sequence has nothing of its first end.
+    let reopened = now().await;
+    assert_eq!(reopened.state, State::Queued);
+    assert!(reopened.report.is_none() && reopened.stop_reason.is_none());
+    assert_eq!(delivery(&reopened), Some(DeliveryState::Pending));
     assert_eq!(lease(&queue).await.job.id, pairs[0].id);
 }

@@ -226,7 +226,12 @@ pub(in crate::queue) fn requeue(
             let text = format!(
                 "UPDATE jobs SET pairs_left = pairs_left + 1, finished = NULL, due = NULL, \
                  ready = NULL, state = CASE WHEN state = 1 THEN 1 ELSE 0 END, error_code = NULL, \
-                 dead = 0, cancel_requested = 0 WHERE id = ?1 RETURNING {COLUMNS}"
+                 dead = 0, cancel_requested = 0, report = NULL, stop_reason = NULL, \
+                 failures = 0, crashes = 0, delays = 0, progress_done = NULL, \
+                 deadline = CASE WHEN finished IS NULL THEN deadline END, \
+                 delivery = CASE WHEN finished IS NULL THEN delivery \
+                 WHEN result_uri IS NOT NULL THEN 0 END \
+                 WHERE id = ?1 RETURNING {COLUMNS}"
             );
             let parent = rows::job(&sql.only(&text, values![parent])?)?;
             effects.changed.push(Arc::new(parent));
