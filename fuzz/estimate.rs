@@ -43,6 +43,7 @@ fn options(pieces: &mut Pieces<'_>, presets: &[Preset]) -> Options {
     options.max_points = (bits & 4 != 0).then_some(40);
     options.crop_m = (bits & 8 != 0).then_some(30.0);
     options.min_range_m = (bits & 16 != 0).then_some(1.0);
+    options.newest_first = bits & 32 != 0;
     options.dt_s = [0.1, 1e-3, 60.0, 0.5][usize::from(bits >> 6)];
     if let Some(field) = options.field_mut() {
         field.max_iterations = 3;

@@ -12,7 +12,7 @@ use super::error::{FileKind, FormatError, shorten};
 use super::feather;
 use super::feather::Table;
 use super::motion::rigid_motion;
-use super::timestamps::SweepTime;
+use super::timestamps::{SweepTime, TimeUnit};
 use crate::flow::RigidTransform;
 
 const KIND: FileKind = FileKind::Poses;
@@ -34,8 +34,8 @@ const AV2_COLUMNS: [&str; 7] = ["qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"];
 ///   poses are those of camera 0; see [`super::read_camera0_from_lidar`].
 /// - JSON: an array of 4 x 4 matrices, row by row.
 /// - Argoverse 2's `city_SE3_egovehicle.feather`: for each sweep the first row whose `timestamp_ns`
-///   equals the sweep's name. They are compared in float64, which resolves 64 ns at Argoverse 2's
-///   times.
+///   equals the time in the sweep's name. They are compared in float64, which resolves 64 ns at
+///   Argoverse 2's times.
 ///
 /// Text and JSON have one pose for every sweep, in order, or the poses of a whole drive. In the
 /// latter case a sweep whose name is a number gets the pose with that index, counted from 0. A name
@@ -49,7 +49,7 @@ const AV2_COLUMNS: [&str; 7] = ["qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"];
 ///   text or JSON that is not finite or not rigid; the error names its sweep.
 /// - `RowCount` where text or JSON has neither one pose for every sweep nor a pose at the index
 ///   that each sweep's name gives.
-/// - `Unsupported` for feather, where a sweep's name is not an integer time stamp. Also where a
+/// - `Unsupported` for feather, where a sweep's name has no time stamp in nanoseconds. Also where a
 ///   column has missing values, no numbers or a compression other than LZ4, and for nested or
 ///   big-endian columns.
 /// - `Missing` for feather, where no row has the time of a sweep, or a column is missing.
@@ -186,7 +186,10 @@ fn read_av2(bytes: &[u8], sweeps: &[&str]) -> Result<Vec<RigidTransform>, Format
     let table = Table::open(bytes)?;
     let time = |frame: &&str| {
         // Nanoseconds in float64, as `Table::each` gives them.
-        let stamp = SweepTime::from_name(frame).and_then(SweepTime::nanoseconds);
+        let in_nanoseconds = |time: &SweepTime| time.unit == TimeUnit::Nanoseconds;
+        let stamp = SweepTime::from_name(frame).filter(in_nanoseconds);
+        let stamp = stamp.map(|time| time.ticks);
+        // A clock that began later has fewer digits.
         let stamp = stamp.or_else(|| stem(frame).parse().ok());
         stamp.map(|time| time as f64).ok_or_else(|| {
             FileKind::Feather.unsupported(format!(

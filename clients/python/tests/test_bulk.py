@@ -2,6 +2,7 @@
 
 import os
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -73,6 +74,27 @@ def test_the_time_between_sweeps_is_that_of_their_names(street, tmp_path):
         expected = fnsf.flow(street.sweep(0).points, street.sweep(1).points, dt_s=dt_s)
         velocity = fnsf.read_flow(output / "one.npz").clusters["velocity"]
         assert np.array_equal(velocity, expected.clusters["velocity"]) and np.abs(velocity).max() > 1
+
+
+def test_a_pair_with_the_newer_sweep_first_takes_its_times_against_the_direction_of_time(tmp_path):
+    street = fnsf.simulate(2, seed=5, beams=16, azimuth_steps=400, speed=25.0, rolling=True)
+    sweeps = [street.sweep(1), street.sweep(0)]
+    names = [str(tmp_path / f"{time}.pcd") for time in (1700000000100, 1700000000000)]
+    for sweep, name in zip(sweeps, names, strict=True):
+        rows = np.column_stack([sweep.points, sweep.times]).astype("<f4")
+        header = (
+            f"VERSION .7\nFIELDS x y z time\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH {len(rows)}\n"
+            f"HEIGHT 1\nPOINTS {len(rows)}\nDATA binary\n"
+        )
+        Path(name).write_bytes(header.encode() + rows.tobytes())
+    read = [fnsf.read_sweep(name) for name in names]
+    labeller = Labeller(str(tmp_path / "labels"), preset="default")
+    assert labeller.label("one", *names)["outcome"] == "labelled"
+    found = fnsf.read_flow(tmp_path / "labels/one.npz").flow
+    for sign, same in [(-1.0, True), (1.0, False)]:
+        times = (sign * read[0].times, sign * read[1].times)
+        flow = fnsf.flow(read[0].points, read[1].points, times=times, dt_s=0.1).flow
+        assert np.array_equal(flow, found) is same
 
 
 @pytest.mark.parametrize(

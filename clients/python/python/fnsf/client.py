@@ -196,6 +196,8 @@ class Client:
             # A server whose machine is gone says nothing.
             ("grpc.keepalive_time_ms", 30_000),
             ("grpc.keepalive_timeout_ms", 10_000),
+            # Also in a call that only waits.
+            ("grpc.http2.max_pings_without_data", 0),
         ]
         if tls:
             trusted = grpc.ssl_channel_credentials(tls if isinstance(tls, bytes) else None)
@@ -263,6 +265,8 @@ class Client:
             masks = [_arrays.mask(f"the ground mask of pc{place}", mask) for place, mask in enumerate(ground, 1)]
             ground = None
         if deadline is not None:
+            if "deadline_ms" in options:
+                raise TypeError("give deadline or deadline_ms, not both")
             options["deadline_ms"] = max(1, round(1000.0 * deadline))
         message = _protocol.options_message({"ground": ground, **options})
         request = _protocol.MESSAGES["EstimateFlowRequest"]
