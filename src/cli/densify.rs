@@ -196,6 +196,15 @@ impl Densify {
         if let Some(output) = &self.output {
             DenseFormat::from_path(output).map_err(Failure::usage)?;
         }
+        let is_png = |path: &PathBuf| path.extension().is_some_and(|ending| ending == "png");
+        if ![&self.depth, &self.picture]
+            .into_iter()
+            .flatten()
+            .all(is_png)
+        {
+            let text = "the name of a picture or a depth image ends in .png";
+            return Err(Failure::usage(anyhow!(text)));
+        }
         let known = self.estimation.files();
         let inputs = self.sweeps.iter().chain(&known).chain(&self.camera);
         files::check_outputs(outputs.into_iter().flatten(), inputs)

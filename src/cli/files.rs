@@ -241,8 +241,8 @@ pub(super) fn identity(path: &Path) -> Option<(u64, u64)> {
     Some((about.dev(), about.ino()))
 }
 
-/// Refuses outputs that cannot be written, and outputs that are the same file as an input or
-/// another output. Called before any work.
+/// Creates the missing folders of outputs. Refuses outputs that cannot be written, and outputs that
+/// are the same file as an input or another output. Called before any work.
 pub(super) fn check_outputs<'a>(
     outputs: impl IntoIterator<Item = &'a PathBuf>,
     inputs: impl IntoIterator<Item = &'a PathBuf>,
@@ -259,8 +259,12 @@ pub(super) fn check_outputs<'a>(
             let message = format!("cannot write {}: {why}", path.display());
             Err(Failure::internal(anyhow!(message)))
         };
+        let folder = path.parent().unwrap_or_else(|| Path::new(""));
+        if let Err(error) = fs::create_dir_all(folder) {
+            return refuse(&format!("its folder cannot be created: {error}"));
+        }
         let Some(index) = place_of(path) else {
-            return refuse("its folder is not there");
+            return refuse("the folder that its link points to is not there");
         };
         if index.is_dir() {
             return refuse("it is a folder");

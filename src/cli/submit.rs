@@ -190,6 +190,8 @@ async fn form(sweeps: &[PathBuf], options: &Value) -> anyhow::Result<Form> {
     let mut form = Form::new().text("options", options.to_string());
     for (index, path) in sweeps.iter().enumerate() {
         let name = match (sweeps.len(), index) {
+            // A dense cloud is made of a sequence.
+            _ if !options["densify"].is_null() => "sweep",
             (1, _) | (2, 0) => "source",
             (2, _) => "target",
             _ => "sweep",

@@ -181,10 +181,32 @@ fn an_output_that_cannot_be_written_is_an_internal_failure_and_leaves_nothing() 
     assert_eq!(done.code, 0);
     let ended = fnsf(
         folder,
-        &["flow", "street/pair_0000.npz", "-o", "missing/out.npz"],
+        &[
+            "flow",
+            "street/pair_0000.npz",
+            "-o",
+            "street/pair_0000.npz/out.npz",
+        ],
     );
     assert_eq!(ended.code, 70, "{}", ended.stderr);
     assert_eq!(ended.stderr.lines().count(), 1);
+    assert!(
+        ended.stderr.contains("cannot be created"),
+        "{}",
+        ended.stderr
+    );
+}
+
+#[test]
+fn the_missing_folders_of_an_output_are_created() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    let done = fnsf(folder, &["synth", "-o", "street", "--beams", "8"]);
+    assert_eq!(done.code, 0);
+    let output = "new/deep/out.npz";
+    let ended = fnsf(folder, &["flow", "street/pair_0000.npz", "-o", output]);
+    assert_eq!(ended.code, 0, "{}", ended.stderr);
+    assert!(folder.join(output).is_file());
 }
 
 /// A folder with three sweeps and their two pairs.

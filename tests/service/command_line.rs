@@ -135,9 +135,9 @@ fn an_output_is_checked_before_anything_is_sent() {
             "written over",
         ),
         (
-            &["submit", "a.pcd", "b.pcd", "-o", "gone/f.npz"],
+            &["submit", "a.pcd", "b.pcd", "-o", "b.pcd/f.npz"],
             70,
-            "folder is not there",
+            "folder cannot be created",
         ),
         (&["submit", "a.pcd", "b.pcd", "-o", "flow.xyz"], 2, ".npz"),
         (&["submit", "a.pcd", "b.pcd", "-o", "flow"], 2, ".npz"),
