@@ -297,7 +297,7 @@ impl Label {
         ))?;
         if found.lacking_sweeps > 0 {
             say(format_args!(
-                "  {} are labelled without a sweep around them that could not be read; another run tries again",
+                "  {} lack a sweep that could not be read; another run tries again",
                 found.lacking_sweeps
             ))?;
         }

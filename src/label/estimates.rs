@@ -68,7 +68,12 @@ impl Estimates<'_> {
             ..RowReport::new(drive.key(wanted.pair), source, target)
         };
         let done = self.estimate(wanted, solver, control, &mut report);
-        if let Err((outcome, reason)) = done {
+        if let Err((mut outcome, reason)) = done {
+            // The tracks end before this pair, though its label is there.
+            let ends_tracks = inputs.tracks && outcome == Outcome::Refused && wanted.is_there;
+            if ends_tracks && !wanted.is_marked && self.io.mark(&wanted.path, &reason).is_err() {
+                outcome = Outcome::Failed;
+            }
             let _the_tally_is_there = self.reports.send(report.ended(outcome, &reason));
             if inputs.tracks && outcome == Outcome::Failed {
                 self.tracking = Tracking::Failed(wanted.drive);
@@ -177,7 +182,7 @@ impl Estimates<'_> {
         let path = left_out_path(&wanted.path);
         let read = || self.io.runtime.block_on(self.io.inputs.output.read(&path));
         let mark = self.io.patiently(read);
-        !left_out.is_empty() && mark.is_ok_and(|mark| mark == mark_text(left_out))
+        !left_out.is_empty() && mark.is_ok_and(|mark| mark == mark_text(left_out).as_bytes())
     }
 
     /// Refuses a pair that needs more memory than a run may take. `neighbors` are the numbers of points
@@ -273,14 +278,15 @@ impl Estimates<'_> {
         report: RowReport,
     ) {
         let drive = &self.io.inputs.plan.drives()[wanted.drive];
-        let is_first = self.changed.replace(wanted.drive) != Some(wanted.drive);
+        let bytes = self.io.inputs.layout.bytes(source, estimate, mask);
+        let is_first = bytes.is_ok() && self.changed.replace(wanted.drive) != Some(wanted.drive);
         let output = Output {
             drive: wanted.drive,
             path: wanted.path.clone(),
             replaces: wanted.is_there,
             removes: (is_first && wanted.has_tracks).then(|| tracks_path(&drive.name)),
             is_marked: wanted.is_marked,
-            bytes: self.io.inputs.layout.bytes(source, estimate, mask),
+            bytes,
             report: report.with(estimate),
         };
         let _the_writer_is_there = self.outputs.send(output);

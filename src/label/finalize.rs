@@ -28,7 +28,8 @@ pub struct Finalized {
     pub pairs: usize,
     /// Pairs whose output is there.
     pub labelled: usize,
-    /// Labelled pairs that lack a sweep of their window, because it could not be read.
+    /// Labelled pairs that another run is to label again: a sweep of theirs or around them could not be
+    /// read.
     pub lacking_sweeps: usize,
     /// Pairs that cannot be labelled.
     pub refused: Vec<RowReport>,

@@ -27,7 +27,7 @@ pub(super) struct Wanted {
     pub(super) path: String,
     /// Whether its output is there.
     pub(super) is_there: bool,
-    /// Whether the mark that its output lacks a sweep of its window is there.
+    /// Whether the mark is there that its output is to be replaced.
     pub(super) is_marked: bool,
     /// Whether the tracks of its drive are there.
     pub(super) has_tracks: bool,
@@ -59,7 +59,7 @@ pub(super) struct Output {
     pub(super) replaces: bool,
     /// A file that is removed before.
     pub(super) removes: Option<String>,
-    /// Whether the mark that it lacks a sweep is there.
+    /// Whether the mark is there that it is to be replaced.
     pub(super) is_marked: bool,
     pub(super) bytes: Result<Vec<u8>, FormatError>,
     pub(super) report: RowReport,
@@ -74,8 +74,8 @@ pub(super) struct Io<'a> {
 }
 
 /// The text of a mark: which sweeps could not be read, and why.
-pub(super) fn mark_text(left_out: &[String]) -> Bytes {
-    Bytes::from(left_out.join("\n") + "\n")
+pub(super) fn mark_text(left_out: &[String]) -> String {
+    left_out.join("\n") + "\n"
 }
 
 impl Io<'_> {
@@ -136,6 +136,13 @@ impl Io<'_> {
         }
     }
 
+    /// Writes the mark of a label: another run is to label its pair again. `text` says why.
+    pub(super) fn mark(&self, path: &str, text: &str) -> Result<(), PlaceError> {
+        let (place, mark) = (&self.inputs.output, left_out_path(path));
+        let bytes = Bytes::from(text.to_owned());
+        self.patiently(|| self.runtime.block_on(place.put(&mark, bytes.clone())))
+    }
+
     /// Writes an output, unless it is there and not to be replaced, and returns its report.
     pub(super) fn write(&self, output: Output) -> RowReport {
         let bytes = match output.bytes {
@@ -155,8 +162,12 @@ impl Io<'_> {
         let prepared = prepared.and_then(|()| match left_out.is_empty() {
             true => Ok(()),
             false => {
-                let text = mark_text(left_out);
-                self.patiently(|| self.runtime.block_on(place.put(&mark, text.clone())))
+                // Until the label is replaced, the mark is none that another run takes for its own.
+                let unfinished = if output.replaces { "replaced:\n" } else { "" };
+                self.mark(
+                    &output.path,
+                    &(unfinished.to_owned() + &mark_text(left_out)),
+                )
             }
         });
         if let Err(error) = prepared {
@@ -177,6 +188,8 @@ impl Io<'_> {
             // The label of another process may lack it.
             if is_new && output.is_marked && left_out.is_empty() {
                 remove(&mark)?;
+            } else if output.replaces && !left_out.is_empty() {
+                self.mark(&output.path, &mark_text(left_out))?;
             }
             Ok(is_new)
         });

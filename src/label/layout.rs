@@ -147,8 +147,9 @@ pub(super) fn check_outputs(plan: &Plan, layout: Layout, tracks: bool) -> Result
     Ok(())
 }
 
-/// The mark of a label that was computed without a sweep of its window, by the label's name. It says
-/// which sweep could not be read.
+/// The mark of a label that is to be replaced once a sweep can be read, by the label's name. It says which
+/// one: a sweep of the window that the label lacks, or one of the pair itself, before which the tracks of
+/// the drive end.
 pub(super) fn left_out_path(path: &str) -> String {
     format!("{LEFT_OUT}/{path}.txt")
 }

@@ -246,7 +246,7 @@ fn rows_that_cannot_be_used_are_reported_and_do_not_stop_the_others() {
         end.stdout
     );
     // All other windows have the damaged sweep.
-    let lacking = "5 are labelled without a sweep";
+    let lacking = "5 lack a sweep";
     assert!(end.stdout.contains(lacking), "{}", end.stdout);
     // The file is mended: all labels are those of a run that has never seen it damaged.
     fs::write(&cut, &bytes).expect("writable");
@@ -258,7 +258,7 @@ fn rows_that_cannot_be_used_are_reported_and_do_not_stop_the_others() {
     assert_eq!(found.len(), 7);
     assert_same(&found, &labels(&folder.join("whole")));
     let end = label(folder, &["drives", "-o", "labels", "--finalize"]);
-    assert!(!end.stdout.contains("without a sweep"), "{}", end.stdout);
+    assert!(!end.stdout.contains("lack a sweep"), "{}", end.stdout);
     let again = label(folder, &["drives", "-o", "labels"]);
     assert!(again.stdout.contains("0 of 7 pairs"), "{}", again.stdout);
 }

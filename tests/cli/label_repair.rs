@@ -45,6 +45,29 @@ fn a_mended_sweep_gives_the_tracks_and_the_flows_of_a_drive_without_fault() {
 }
 
 #[test]
+fn a_pair_that_is_refused_though_its_label_is_there_gets_its_tracks_once_it_is_mended() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    drives(folder, 1, "8");
+    let run = |output: &str| tracked(folder, output, &[]);
+    for output in ["reference", "labels"] {
+        assert_eq!(run(output).code, 0);
+    }
+    // A kill before the tracks; then a sweep is damaged.
+    fs::remove_file(folder.join("labels/d0/tracks.json")).expect("there");
+    let sweep = folder.join("drives/d0/sweep_0003.pcd");
+    let bytes = fs::read(&sweep).expect("written");
+    fs::write(&sweep, &bytes[..bytes.len() / 2]).expect("writable");
+    assert_eq!(run("labels").code, 65);
+    let [reference, cut] = ["reference", "labels"].map(|name| labels(&folder.join(name)));
+    assert!(cut["d0/tracks.json"] != reference["d0/tracks.json"]);
+    fs::write(&sweep, &bytes).expect("writable");
+    let mended = run("labels");
+    assert_eq!(mended.code, 0, "{}", mended.stderr);
+    assert_same(&labels(&folder.join("labels")), &reference);
+}
+
+#[test]
 fn a_rerun_while_a_sweep_is_damaged_leaves_labels_and_tracks_alone() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
