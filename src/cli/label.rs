@@ -32,8 +32,8 @@ const NAMED: usize = 10;
 ///
 /// Each pair has one output, whose name is a function of the pair, and which is written only where
 /// there is none, or where it lacks a sweep that can be read now. So any number of processes may label
-/// one manifest, be killed and started again. Give each process a shard, and run `fnsf label ... --finalize` at the
-/// end.
+/// one manifest, be killed and started again. Give each process a shard, and run
+/// `fnsf label ... --finalize` at the end.
 ///
 /// A pair that cannot be labelled is reported and does not stop the others. SIGTERM and Ctrl-C
 /// finish the pair that is computed. Exit codes: 0 all is done, 65 some pairs are refused, 75 try

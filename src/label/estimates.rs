@@ -28,7 +28,7 @@ pub(super) struct Estimates<'a> {
     pub(super) outputs: SyncSender<Output>,
     pub(super) reports: Sender<RowReport>,
     pub(super) tracking: Tracking,
-    /// The last drive of which this run has written an output.
+    /// The drive whose output was written last in this run.
     pub(super) changed: Option<usize>,
 }
 

@@ -148,11 +148,24 @@ fn a_deadline_before_the_first_iteration_still_gives_a_flow() {
     assert!(estimate.flow.iter().flatten().all(|f| f.is_finite()));
 }
 
-/// A device that has no memory for cells below a size, metres. Counts the refusals.
+/// A device that has no memory for cells below a size, metres. Counts the refusals, and keeps the source
+/// that its last target was prepared for.
 struct Scarce {
     cpu: CpuBackend,
     least_cell_m: f64,
     refused: AtomicUsize,
+    source: Mutex<Vec<Point>>,
+}
+
+impl Scarce {
+    fn new(least_cell_m: f64) -> Self {
+        Self {
+            cpu: CpuBackend::new(Some(2)).expect("threads"),
+            least_cell_m,
+            refused: AtomicUsize::new(0),
+            source: Mutex::default(),
+        }
+    }
 }
 
 impl Backend for Scarce {
@@ -182,6 +195,7 @@ impl Backend for Scarce {
                 },
             });
         }
+        *self.source.lock().expect("no panic") = source.to_vec();
         self.cpu.prepare_target(source, target, options, control)
     }
 
@@ -209,11 +223,7 @@ fn a_finer_transform_that_the_device_cannot_hold_leaves_the_coarse_one() {
         .expect("a distance transform")
         .transform
         .cell_m;
-    let backend = Scarce {
-        cpu: CpuBackend::new(Some(2)).expect("threads"),
-        least_cell_m: 3.0 * cell_m,
-        refused: AtomicUsize::new(0),
-    };
+    let backend = Scarce::new(3.0 * cell_m);
     let problem = Problem::pair(&pair.source, &pair.target);
     let estimate = estimate(&backend, &problem, &options, &Tight).expect("a flow");
     assert_eq!(
@@ -223,37 +233,6 @@ fn a_finer_transform_that_the_device_cannot_hold_leaves_the_coarse_one() {
     );
     assert!(estimate.fit().expect("a fit").iterations > 0);
     assert!(estimate.flow.iter().flatten().all(|f| f.is_finite()));
-}
-
-/// A device that keeps the source that a target is prepared for.
-struct Watched {
-    cpu: CpuBackend,
-    source: Mutex<Vec<Point>>,
-}
-
-impl Backend for Watched {
-    fn name(&self) -> String {
-        self.cpu.name()
-    }
-
-    fn host(&self) -> &Host {
-        self.cpu.host()
-    }
-
-    fn prepare_target(
-        &self,
-        source: &[Point],
-        target: &[Point],
-        options: &LossOptions,
-        control: &dyn Control,
-    ) -> Result<Box<dyn PreparedTarget>, BackendError> {
-        *self.source.lock().expect("no panic") = source.to_vec();
-        self.cpu.prepare_target(source, target, options, control)
-    }
-
-    fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError> {
-        self.cpu.evaluate(network, points)
-    }
 }
 
 #[test]
@@ -266,10 +245,7 @@ fn a_cycle_is_prepared_for_the_source_in_the_frame_of_the_target() {
         let field = options.field_mut().expect("a field");
         field.max_iterations = 0;
         field.network_mut().expect("a network").cycle = cycle;
-        let backend = Watched {
-            cpu: CpuBackend::new(Some(2)).expect("threads"),
-            source: Mutex::default(),
-        };
+        let backend = Scarce::new(0.0);
         let problem = Problem::pair(&pair.source, &pair.target);
         estimate(&backend, &problem, &options, &Uncontrolled).expect("a flow");
         let expected = match cycle {
