@@ -1,10 +1,10 @@
 //! The estimates of a shard, pair by pair.
 
 use std::collections::BTreeMap;
-use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::atomic::Ordering;
 use std::sync::mpsc::{Receiver, Sender, SyncSender};
 
-use super::io::{At, Io, Loaded, Output, Unread, Wanted, mark_text};
+use super::io::{At, Io, Loaded, Output, Unread, Wanted, isolated, mark_text};
 use super::layout::{left_out_path, tracks_path};
 use super::report::{Outcome, RowReport};
 use super::types::Solver;
@@ -77,6 +77,7 @@ impl Estimates<'_> {
             let _the_tally_is_there = self.reports.send(report.ended(outcome, &reason));
             if inputs.tracks && outcome == Outcome::Failed {
                 self.tracking = Tracking::Failed(wanted.drive);
+                self.io.left_alone.store(wanted.drive, Ordering::Relaxed);
                 return;
             }
             if inputs.tracks {
@@ -147,11 +148,7 @@ impl Estimates<'_> {
         self.check_memory(clouds, neighbors, &solver_options)?;
         let solve =
             || solver.solve(&|backend| windowed.estimate(backend, sweep, &solver_options, control));
-        // One pair must not end the others.
-        let solved = catch_unwind(AssertUnwindSafe(solve)).map_err(|_| {
-            let text = "its estimate has panicked: this is a defect of the program";
-            (Outcome::Refused, text.to_owned())
-        })?;
+        let solved = isolated("its estimate", solve).map_err(|text| (Outcome::Refused, text))?;
         let mut estimate = solved.map_err(|error| failed(&error))?;
         let [source, target] = estimate.sweeps([&source.points, &target.points]);
         if inputs.tracks {
@@ -227,19 +224,30 @@ impl Estimates<'_> {
         self.held = self.held.split_off(&first);
         let last = (wanted.drive, range.end - 1);
         while !self.held.contains_key(&last) {
-            let Ok((at, mut loaded)) = self.read.recv() else {
+            let Ok((at, loaded)) = self.read.recv() else {
                 break;
             };
             // Of a drive that has failed.
             if at < first {
                 continue;
             }
-            if let Ok(loaded) = &mut loaded {
-                let sweep = std::mem::take(&mut loaded.sweep);
-                loaded.sweep = sweep.prepared(&self.io.inputs.options.solver_options(usize::MAX));
-            }
-            self.held.insert(at, loaded);
+            let prepared = loaded.and_then(|loaded| self.prepared(at, loaded));
+            self.held.insert(at, prepared);
         }
+    }
+
+    /// A sweep with its ground, see [`Sweep::prepared`].
+    fn prepared(&self, (drive, sweep): At, loaded: Loaded) -> Result<Loaded, Unread> {
+        let uri = &self.io.inputs.plan.drives()[drive].sweeps[sweep].uri;
+        let options = self.io.inputs.options.solver_options(usize::MAX);
+        let sweep = isolated("its ground segmentation", || {
+            loaded.sweep.prepared(&options)
+        });
+        let sweep = sweep.map_err(|reason| Unread {
+            reason: format!("{uri}: {reason}"),
+            may_pass: false,
+        })?;
+        Ok(Loaded { sweep, ..loaded })
     }
 
     /// The rows that the layout asks for.

@@ -1,7 +1,9 @@
 //! Reading and writing of a run, with patience for stores that fail.
 
+use std::fmt::Display;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread;
 use std::time::Duration;
 
@@ -14,6 +16,9 @@ use super::report::{Outcome, RowReport};
 use super::types::Inputs;
 use crate::flow::{Point, Sweep};
 use crate::formats::{FormatError, PointTimes, SweepClock, read_timed_cloud, sweep_time_s};
+
+/// Begins a mark while its label is replaced, so that another run does not take the mark for its own.
+const UNFINISHED: &str = "replaced:\n";
 
 /// Times that a store is asked before a pair has failed.
 const ATTEMPTS: u32 = 4;
@@ -71,6 +76,20 @@ pub(super) struct Io<'a> {
     pub(super) inputs: &'a Inputs<'a>,
     pub(super) runtime: &'a Runtime,
     pub(super) stop: &'a AtomicBool,
+    /// The index of the drive that is left to the next run, see [`Tracking::Failed`]: its other sweeps are not
+    /// read.
+    ///
+    /// [`Tracking::Failed`]: super::estimates::Tracking::Failed
+    pub(super) left_alone: &'a AtomicUsize,
+}
+
+/// Does the work of one sweep or pair: a panic must not end the others.
+///
+/// # Errors
+/// A text that says that `what` has panicked.
+pub(super) fn isolated<T>(what: &str, work: impl FnOnce() -> T) -> Result<T, String> {
+    let done = catch_unwind(AssertUnwindSafe(work));
+    done.map_err(|_| format!("{what} has panicked: this is a defect of the program"))
 }
 
 /// The text of a mark: which sweeps could not be read, and why.
@@ -94,10 +113,13 @@ impl Io<'_> {
             reason: error.to_string(),
         })?;
         let name = uri.rsplit('/').next();
-        let read = read_timed_cloud(&bytes, name).map_err(|error| Unread {
+        let unread = |error: &dyn Display| Unread {
             may_pass: false,
             reason: format!("{uri}: {error}"),
-        })?;
+        };
+        let read = isolated("its reader", || read_timed_cloud(&bytes, name));
+        let read = read.map_err(|error| unread(&error))?;
+        let read = read.map_err(|error| unread(&error))?;
         let clock = read.times.as_ref().map(PointTimes::clock);
         let sweep = Sweep {
             points: read.cloud.points,
@@ -143,6 +165,24 @@ impl Io<'_> {
         self.patiently(|| self.runtime.block_on(place.put(&mark, bytes.clone())))
     }
 
+    fn remove(&self, path: &str) -> Result<(), PlaceError> {
+        match self.patiently(|| self.runtime.block_on(self.inputs.output.remove(path))) {
+            Err(PlaceError::Missing(_)) => Ok(()),
+            removed => removed,
+        }
+    }
+
+    /// Removes the mark of a label that this process has replaced by `bytes`. Another process, which could not
+    /// read a sweep, may have replaced it since: then the mark stays.
+    fn unmark(&self, path: &str, bytes: &Bytes) -> Result<(), PlaceError> {
+        self.remove(&left_out_path(path))?;
+        let kept = self.patiently(|| self.runtime.block_on(self.inputs.output.read(path)));
+        match kept {
+            Ok(kept) if kept == *bytes => Ok(()),
+            kept => self.mark(path, UNFINISHED).and(kept.map(drop)),
+        }
+    }
+
     /// Writes an output, unless it is there and not to be replaced, and returns its report.
     pub(super) fn write(&self, output: Output) -> RowReport {
         let bytes = match output.bytes {
@@ -150,20 +190,14 @@ impl Io<'_> {
             Ok(bytes) => Bytes::from(bytes),
         };
         let place = &self.inputs.output;
-        let remove = |path: &str| match self.patiently(|| self.runtime.block_on(place.remove(path)))
-        {
-            Err(PlaceError::Missing(_)) => Ok(()),
-            removed => removed,
-        };
-        let mark = left_out_path(&output.path);
         let left_out = &output.report.left_out;
         // The mark is there whenever the label is.
-        let prepared = output.removes.as_deref().map_or(Ok(()), remove);
+        let removes = output.removes.as_deref();
+        let prepared = removes.map_or(Ok(()), |path| self.remove(path));
         let prepared = prepared.and_then(|()| match left_out.is_empty() {
             true => Ok(()),
             false => {
-                // Until the label is replaced, the mark is none that another run takes for its own.
-                let unfinished = if output.replaces { "replaced:\n" } else { "" };
+                let unfinished = if output.replaces { UNFINISHED } else { "" };
                 self.mark(
                     &output.path,
                     &(unfinished.to_owned() + &mark_text(left_out)),
@@ -185,9 +219,9 @@ impl Io<'_> {
             })
         };
         let written = self.patiently(put).and_then(|is_new| {
-            // The label of another process may lack it.
+            // The label of another process may lack a sweep.
             if is_new && output.is_marked && left_out.is_empty() {
-                remove(&mark)?;
+                self.unmark(&output.path, &bytes)?;
             } else if output.replaces && !left_out.is_empty() {
                 self.mark(&output.path, &mark_text(left_out))?;
             }
@@ -200,5 +234,53 @@ impl Io<'_> {
             Err(error) => return report.ended(Outcome::of_trouble(error.may_pass()), &error),
         }
         report
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::layout::Layout;
+    use super::super::manifest::read_manifest;
+    use super::super::places::Place;
+    use super::super::plan::Plan;
+    use super::super::shard::Shard;
+    use super::*;
+    use crate::job::JobOptions;
+
+    #[test]
+    fn a_mark_stays_where_another_process_has_replaced_the_label_since() {
+        const PATH: &str = "d/0.npz";
+        let folder = tempfile::tempdir().expect("a folder");
+        let place = Place::open(&folder.path().to_string_lossy()).expect("a place");
+        let manifest = "drive,sweep\nd,0.pcd\nd,1.pcd\n";
+        let drives = read_manifest(manifest.into(), None).expect("a drive");
+        let inputs = Inputs {
+            plan: &Plan::new(drives).expect("a plan"),
+            options: &JobOptions::default(),
+            layout: Layout::default(),
+            poses: false,
+            tracks: false,
+            masks: None,
+            ignore_times: false,
+            most_bytes: usize::MAX,
+            shard: Shard::default(),
+            output: place.clone(),
+        };
+        let runtime = Runtime::new().expect("a runtime");
+        let io = Io {
+            inputs: &inputs,
+            runtime: &runtime,
+            stop: &AtomicBool::new(false),
+            left_alone: &AtomicUsize::new(usize::MAX),
+        };
+        let whole = Bytes::from("of all sweeps");
+        for (there, is_marked) in [("of all sweeps", false), ("without a sweep", true)] {
+            io.mark(PATH, "1.pcd is not there\n").expect("written");
+            let put = place.put(PATH, there.into());
+            runtime.block_on(put).expect("written");
+            io.unmark(PATH, &whole).expect("no failure");
+            let mark = runtime.block_on(place.read(&left_out_path(PATH)));
+            assert_eq!(mark.is_ok(), is_marked, "{there}");
+        }
     }
 }

@@ -88,7 +88,7 @@ fn read_ahead(io: &Io<'_>, wanted: &[Wanted], sweeps: &SyncSender<(At, Result<Lo
         let (next, is_timed) = next.entry(wanted.drive).or_insert_with(of_drive);
         let is_timed = *is_timed;
         for index in window(wanted.pair, drive.sweeps.len(), size) {
-            if index < *next {
+            if index < *next || io.left_alone.load(Ordering::Relaxed) == wanted.drive {
                 continue;
             }
             *next = index + 1;

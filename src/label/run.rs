@@ -1,7 +1,7 @@
 //! A run: one process labels the pairs of its shard.
 
 use std::collections::HashSet;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, AtomicUsize};
 use std::time::Instant;
 
 use tokio::runtime::{Builder, Runtime};
@@ -161,6 +161,7 @@ pub fn run(
         inputs,
         runtime: &runtime,
         stop,
+        left_alone: &AtomicUsize::new(usize::MAX),
     };
     let mut done = label(&io, &wanted, total, solver, control, told)?;
     done.seconds = began.elapsed().as_secs_f64();

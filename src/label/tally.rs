@@ -24,6 +24,8 @@ pub(super) struct Tally<'a> {
     pub(super) done: Done,
     began: Instant,
     written: Instant,
+    /// Whether the store has refused the part that is being filled.
+    has_failed: bool,
     /// The name of the report without its number and ending.
     name: String,
     /// Number of the part that is being filled.
@@ -51,6 +53,7 @@ impl<'a> Tally<'a> {
             },
             began: Instant::now(),
             written: Instant::now(),
+            has_failed: false,
             name: format!("_report/{attempt}-{}-of-{}", shard.index, shard.count),
             part: 0,
         }
@@ -67,10 +70,12 @@ impl<'a> Tally<'a> {
             told(&self.told());
         }
         let is_full = self.reports.len() >= PART;
-        if is_full || self.written.elapsed() > REPORT_EVERY {
+        // A part that the store does not take is written again with the next reports, and not at once: each
+        // attempt has patience.
+        if self.written.elapsed() > REPORT_EVERY || (is_full && !self.has_failed) {
+            self.has_failed = self.write().is_err();
             self.written = Instant::now();
-            // A part that the store does not take is written again with the next reports.
-            if self.write().is_ok() && is_full {
+            if is_full && !self.has_failed {
                 self.part += 1;
                 self.reports.clear();
             }

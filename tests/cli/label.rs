@@ -341,6 +341,7 @@ fn an_output_belongs_to_one_run() {
         ),
         (&["--ego", "x.txt"], "x.txt"),
         (&["--shard", "4/4"], "no shard"),
+        (&["--shards", "4"], "goes with --shard-from-env"),
         (&["--shard-from-env"], "names no shard"),
     ] {
         let refused = label(folder, &[&["drives", "-o", "others"], wrong].concat());

@@ -2,6 +2,13 @@
 
 use std::fs;
 use std::process::Command;
+use std::sync::atomic::AtomicBool;
+
+use fnsf::flow::cpu::CpuBackend;
+use fnsf::flow::field::Backend;
+use fnsf::flow::{Estimate, FlowError, Uncontrolled};
+use fnsf::job::JobOptions;
+use fnsf::label::{Inputs, Layout, Place, Shard, Solver, open_plan, run};
 
 use super::label::{drives, label, labels};
 
@@ -55,8 +62,13 @@ fn names_and_files_that_cannot_work_are_refused_and_do_not_hang() {
         "{}",
         refused.stderr
     );
-    let refused = label(folder, &["drives", "-o", "drives"]);
-    assert_eq!(refused.code, 2, "{}", refused.stderr);
+    let uri = format!("file://{}/drives", folder.display());
+    for output in ["drives", "drives/", &uri] {
+        let refused = label(folder, &["drives", "-o", output]);
+        assert_eq!(refused.code, 2, "{output}: {}", refused.stderr);
+        let said = "the output is the folder of the sweeps";
+        assert!(refused.stderr.contains(said), "{}", refused.stderr);
+    }
 
     // Links multiply nothing.
     for (to, name) in [
@@ -164,4 +176,50 @@ fn a_pair_that_needs_more_memory_than_the_run_may_take_is_refused() {
     );
     assert_eq!(done.code, 65, "{}", done.stderr);
     assert!(done.stdout.contains("allows 16"), "{}", done.stdout);
+}
+
+/// A solver that panics at the pair `at`, counted from 1.
+struct Panicking {
+    at: usize,
+    solved: usize,
+}
+
+impl Solver for Panicking {
+    fn solve(
+        &mut self,
+        work: &dyn Fn(&dyn Backend) -> Result<Estimate, FlowError>,
+    ) -> Result<Estimate, FlowError> {
+        self.solved += 1;
+        assert_ne!(self.solved, self.at, "a defect");
+        work(&CpuBackend::new(Some(1)).expect("a thread"))
+    }
+}
+
+#[test]
+fn a_pair_whose_estimate_panics_is_refused_and_the_others_are_labelled() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    drives(folder, 1, "4");
+    let place = |name: &str| folder.join(name).to_string_lossy().into_owned();
+    fs::create_dir(place("labels")).expect("a folder");
+    let plan = open_plan(&place("drives")).expect("a drive");
+    let inputs = Inputs {
+        plan: &plan,
+        options: &JobOptions::default(),
+        layout: Layout::default(),
+        poses: false,
+        tracks: false,
+        masks: None,
+        ignore_times: false,
+        most_bytes: 1 << 30,
+        shard: Shard::default(),
+        output: Place::open(&place("labels")).expect("a place"),
+    };
+    let mut solver = Panicking { at: 2, solved: 0 };
+    let goes_on = AtomicBool::new(false);
+    let done = run(&inputs, &mut solver, &Uncontrolled, &goes_on, &mut |_| {});
+    let done = done.expect("a run");
+    assert_eq!((done.labelled, done.refused, done.failed), (2, 1, 0));
+    let said = done.troubles[0].error.as_deref().expect("a reason");
+    assert!(said.contains("its estimate has panicked"), "{said}");
 }

@@ -117,6 +117,24 @@ fn pairs_are_read_and_other_types_are_named() {
 }
 
 #[test]
+fn a_pose_with_a_missing_number_is_refused() {
+    let mut list = ListBuilder::new(Float64Builder::new());
+    for number in 0..12 {
+        list.values().append_option((number != 5).then_some(1.0));
+    }
+    list.append(true);
+    let pose: ArrayRef = Arc::new(list.finish());
+    let sweep: ArrayRef = Arc::new(StringArray::from(vec!["0.pcd"]));
+    let columns = vec![("sweep", sweep), ("pose", pose)];
+    let refused = read_manifest(file(columns, Compression::SNAPPY), None);
+    let said = refused.expect_err("11 numbers").to_string();
+    assert!(
+        said.contains("row 1: a number of pose is missing"),
+        "{said}"
+    );
+}
+
+#[test]
 fn damaged_tables_are_refused() {
     let whole = sweeps(Compression::SNAPPY);
     for length in (4..whole.len()).step_by(7) {

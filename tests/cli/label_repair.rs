@@ -1,8 +1,9 @@
 //! Tests of runs of `fnsf label` that go wrong and are repaired.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::os::unix::net::UnixListener;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::label::{assert_same, drives, label, labels};
 use super::program::Ended;
@@ -17,186 +18,195 @@ fn manifest(folder: &Path, name: &str, sweeps: usize, apart_s: f64) {
     fs::write(folder.join(name), text).expect("writable");
 }
 
-/// Labels the drives with tracks.
-fn tracked(folder: &Path, output: &str, more: &[&str]) -> Ended {
-    let run = ["drives", "-o", output, "--tracks", "--preset", "default"];
-    label(folder, &[&run[..], more].concat())
+/// A street, and the runs that label it with tracks.
+struct Street {
+    folder: tempfile::TempDir,
+}
+
+impl Street {
+    fn of(sweeps: &str) -> Self {
+        let folder = tempfile::tempdir().expect("a folder");
+        drives(folder.path(), 1, sweeps);
+        Self { folder }
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    /// Labels the street, or what `more` says.
+    fn run(&self, output: &str, more: &[&str]) -> Ended {
+        let run = ["drives", "-o", output, "--tracks", "--preset", "default"];
+        label(self.folder.path(), &[&run[..], more].concat())
+    }
+
+    /// Labels the street without fault.
+    fn complete(&self, output: &str) {
+        let ended = self.run(output, &[]);
+        assert_eq!(ended.code, 0, "{}", ended.stderr);
+    }
+
+    /// The files of labels and tracks in an output.
+    fn labels(&self, output: &str) -> BTreeMap<String, Vec<u8>> {
+        labels(&self.path(output))
+    }
+
+    /// Cuts a sweep to its half.
+    fn damage(&self, sweep: usize) -> Replaced {
+        let replaced = self.replace(sweep);
+        let half = &replaced.sound[..replaced.sound.len() / 2];
+        fs::write(&replaced.path, half).expect("writable");
+        replaced
+    }
+
+    /// Makes a sweep unreadable for a while: opening a socket fails as a disk does.
+    fn fail(&self, sweep: usize) -> Replaced {
+        let replaced = self.replace(sweep);
+        let _stays_in_its_place = UnixListener::bind(&replaced.path).expect("a socket");
+        replaced
+    }
+
+    fn replace(&self, sweep: usize) -> Replaced {
+        let path = self.path(&format!("drives/d0/sweep_{sweep:04}.pcd"));
+        let sound = fs::read(&path).expect("written");
+        fs::remove_file(&path).expect("there");
+        Replaced { path, sound }
+    }
+}
+
+/// A sweep that cannot be used until it is mended.
+struct Replaced {
+    path: PathBuf,
+    sound: Vec<u8>,
+}
+
+impl Replaced {
+    fn mend(self) {
+        fs::remove_file(&self.path).expect("there");
+        fs::write(&self.path, &self.sound).expect("writable");
+    }
 }
 
 #[test]
 fn a_mended_sweep_gives_the_tracks_and_the_flows_of_a_drive_without_fault() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let folder = folder.path();
-    drives(folder, 1, "8");
-    let run = |output: &str| tracked(folder, output, &[]);
-    assert_eq!(run("reference").code, 0);
-    let sweep = folder.join("drives/d0/sweep_0003.pcd");
-    let bytes = fs::read(&sweep).expect("written");
-    fs::write(&sweep, &bytes[..bytes.len() / 2]).expect("writable");
-    let refused = run("labels");
+    let street = Street::of("8");
+    street.complete("reference");
+    let sweep = street.damage(3);
+    let refused = street.run("labels", &[]);
     assert_eq!(refused.code, 65, "{}", refused.stderr);
-    let [reference, damaged] = ["reference", "labels"].map(|name| labels(&folder.join(name)));
+    let [reference, damaged] = ["reference", "labels"].map(|name| street.labels(name));
     assert_eq!(damaged.len(), 7 + 1 - 2);
     assert!(damaged["d0/tracks.json"] != reference["d0/tracks.json"]);
-    fs::write(&sweep, &bytes).expect("writable");
-    let mended = run("labels");
-    assert_eq!(mended.code, 0, "{}", mended.stderr);
-    assert_same(&labels(&folder.join("labels")), &reference);
+    sweep.mend();
+    street.complete("labels");
+    assert_same(&street.labels("labels"), &reference);
 }
 
 #[test]
 fn a_pair_that_is_refused_though_its_label_is_there_gets_its_tracks_once_it_is_mended() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let folder = folder.path();
-    drives(folder, 1, "8");
-    let run = |output: &str| tracked(folder, output, &[]);
+    let street = Street::of("8");
     for output in ["reference", "labels"] {
-        assert_eq!(run(output).code, 0);
+        street.complete(output);
     }
     // A kill before the tracks; then a sweep is damaged.
-    fs::remove_file(folder.join("labels/d0/tracks.json")).expect("there");
-    let sweep = folder.join("drives/d0/sweep_0003.pcd");
-    let bytes = fs::read(&sweep).expect("written");
-    fs::write(&sweep, &bytes[..bytes.len() / 2]).expect("writable");
-    assert_eq!(run("labels").code, 65);
-    let [reference, cut] = ["reference", "labels"].map(|name| labels(&folder.join(name)));
+    fs::remove_file(street.path("labels/d0/tracks.json")).expect("there");
+    let sweep = street.damage(3);
+    assert_eq!(street.run("labels", &[]).code, 65);
+    let [reference, cut] = ["reference", "labels"].map(|name| street.labels(name));
     assert!(cut["d0/tracks.json"] != reference["d0/tracks.json"]);
-    fs::write(&sweep, &bytes).expect("writable");
-    let mended = run("labels");
-    assert_eq!(mended.code, 0, "{}", mended.stderr);
-    assert_same(&labels(&folder.join("labels")), &reference);
+    sweep.mend();
+    street.complete("labels");
+    assert_same(&street.labels("labels"), &reference);
 }
 
 #[test]
 fn a_rerun_while_a_sweep_is_damaged_leaves_labels_and_tracks_alone() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let folder = folder.path();
-    drives(folder, 1, "8");
-    let run = |output: &str| label(folder, &["drives", "-o", output, "--tracks"]);
+    let street = Street::of("8");
+    // The windows of `label` have more sweeps than two: more labels lack the damaged one.
+    let run = |output: &str| label(street.folder.path(), &["drives", "-o", output, "--tracks"]);
     assert_eq!(run("reference").code, 0);
-    let sweep = folder.join("drives/d0/sweep_0003.pcd");
-    let bytes = fs::read(&sweep).expect("written");
-    fs::write(&sweep, &bytes[..bytes.len() / 2]).expect("writable");
+    let sweep = street.damage(3);
     assert_eq!(run("labels").code, 65);
     let modified = || {
-        let file = folder.join("labels/d0/sweep_0000.npz");
-        let about = fs::metadata(file).expect("a label");
+        let about = fs::metadata(street.path("labels/d0/sweep_0000.npz")).expect("a label");
         about.modified().expect("a time")
     };
-    let (before, written) = (labels(&folder.join("labels")), modified());
+    let (before, written) = (street.labels("labels"), modified());
     assert_eq!(run("labels").code, 65);
-    assert_same(&labels(&folder.join("labels")), &before);
+    assert_same(&street.labels("labels"), &before);
     assert_eq!(modified(), written);
-    fs::write(&sweep, &bytes).expect("writable");
+    sweep.mend();
     let mended = run("labels");
     assert_eq!(mended.code, 0, "{}", mended.stderr);
-    let reference = labels(&folder.join("reference"));
+    let reference = street.labels("reference");
     assert!(before["d0/sweep_0000.npz"] != reference["d0/sweep_0000.npz"]);
-    assert_same(&labels(&folder.join("labels")), &reference);
+    assert_same(&street.labels("labels"), &reference);
 }
 
 #[test]
 fn a_repair_that_is_interrupted_is_done_by_the_next_run() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let folder = folder.path();
-    drives(folder, 1, "8");
-    let run = |output: &str, more: &[&str]| tracked(folder, output, more);
-    assert_eq!(run("reference", &[]).code, 0);
-    let [damaged, away] =
-        ["0002", "0006"].map(|sweep| folder.join(format!("drives/d0/sweep_{sweep}.pcd")));
-    let [sound, other] = [&damaged, &away].map(|path| fs::read(path).expect("written"));
-    fs::write(&damaged, &sound[..sound.len() / 2]).expect("writable");
-    assert_eq!(run("labels", &[]).code, 65);
+    let street = Street::of("8");
+    street.complete("reference");
+    let sweep = street.damage(2);
+    assert_eq!(street.run("labels", &[]).code, 65);
     // The sweep is mended, and the store fails in the middle of the repair.
-    fs::write(&damaged, &sound).expect("writable");
-    fs::remove_file(&away).expect("there");
-    let socket = UnixListener::bind(&away).expect("a socket");
-    let failed = run("labels", &[]);
+    sweep.mend();
+    let away = street.fail(6);
+    let failed = street.run("labels", &[]);
     assert_eq!(failed.code, 75, "{}", failed.stderr);
-    assert_eq!(run("labels", &["--finalize"]).code, 75, "a pair is missing");
-    drop(socket);
-    fs::remove_file(&away).expect("there");
-    fs::write(&away, &other).expect("writable");
-    let repaired = run("labels", &[]);
-    assert_eq!(repaired.code, 0, "{}", repaired.stderr);
-    let [reference, found] = ["reference", "labels"].map(|name| labels(&folder.join(name)));
-    assert_same(&found, &reference);
-    assert_eq!(run("labels", &["--finalize"]).code, 0);
+    let end = street.run("labels", &["--finalize"]);
+    assert_eq!(end.code, 75, "a pair is missing");
+    away.mend();
+    street.complete("labels");
+    assert_same(&street.labels("labels"), &street.labels("reference"));
+    assert_eq!(street.run("labels", &["--finalize"]).code, 0);
 
     // A label that is deleted, and whose sweep is then damaged, is refused and not missing.
-    fs::remove_file(folder.join("labels/d0/sweep_0006.npz")).expect("there");
-    fs::remove_file(folder.join("labels/d0/tracks.json")).expect("there");
-    fs::write(folder.join("drives/d0/sweep_0007.pcd"), "no cloud").expect("writable");
-    assert_eq!(run("labels", &[]).code, 65);
-    let end = run("labels", &["--finalize"]);
+    fs::remove_file(street.path("labels/d0/sweep_0006.npz")).expect("there");
+    fs::remove_file(street.path("labels/d0/tracks.json")).expect("there");
+    let _stays_damaged = street.damage(7);
+    assert_eq!(street.run("labels", &[]).code, 65);
+    let end = street.run("labels", &["--finalize"]);
     assert_eq!(end.code, 0, "{}", end.stderr);
     assert!(end.stdout.contains("refused"), "{}", end.stdout);
 }
 
 #[test]
 fn flows_without_the_tracks_of_their_drive_are_missing_though_they_were_refused_once() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let folder = folder.path();
-    drives(folder, 1, "3");
-    let run = |output: &str, more: &[&str]| tracked(folder, output, more);
-    assert_eq!(run("reference", &[]).code, 0);
-    let sweep = folder.join("drives/d0/sweep_0001.pcd");
-    let sound = fs::read(&sweep).expect("written");
-    fs::write(&sweep, &sound[..sound.len() / 2]).expect("writable");
-    assert_eq!(run("labels", &[]).code, 65);
-    assert_eq!(run("labels", &["--finalize"]).code, 0, "both are refused");
+    let street = Street::of("3");
+    street.complete("reference");
+    let sweep = street.damage(1);
+    assert_eq!(street.run("labels", &[]).code, 65);
+    let end = street.run("labels", &["--finalize"]);
+    assert_eq!(end.code, 0, "both are refused");
     // What a repair leaves that is killed before it writes the tracks.
-    fs::write(&sweep, &sound).expect("writable");
-    fs::remove_file(folder.join("labels/d0/tracks.json")).expect("there");
+    sweep.mend();
+    fs::remove_file(street.path("labels/d0/tracks.json")).expect("there");
     for name in ["d0/sweep_0000.npz", "d0/sweep_0001.npz"] {
-        let [from, to] = ["reference", "labels"].map(|output| folder.join(output).join(name));
+        let [from, to] = ["reference", "labels"].map(|output| street.path(output).join(name));
         fs::copy(from, to).expect("copied");
     }
-    assert_eq!(run("labels", &["--finalize"]).code, 75, "both are missing");
-    assert_eq!(run("labels", &[]).code, 0);
-    let [reference, found] = ["reference", "labels"].map(|name| labels(&folder.join(name)));
-    assert_same(&found, &reference);
+    let end = street.run("labels", &["--finalize"]);
+    assert_eq!(end.code, 75, "both are missing");
+    street.complete("labels");
+    assert_same(&street.labels("labels"), &street.labels("reference"));
 }
 
 #[test]
 fn a_store_that_fails_for_a_while_changes_no_tracks_and_no_flows() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let folder = folder.path();
-    drives(folder, 1, "8");
-    manifest(folder, "drives.csv", 8, 0.1);
-    let tracked = |output: &str| {
-        label(
-            folder,
-            &[
-                "drives.csv",
-                "-o",
-                output,
-                "--tracks",
-                "--preset",
-                "default",
-            ],
-        )
-    };
-    assert_eq!(tracked("reference").code, 0);
-    let sweep = folder.join("drives/d0/sweep_0004.pcd");
-    let bytes = fs::read(&sweep).expect("written");
-    fs::remove_file(&sweep).expect("there");
-    // Opening a socket fails as a disk does.
-    let socket = UnixListener::bind(&sweep).expect("a socket");
-    let failed = tracked("labels");
+    let street = Street::of("8");
+    street.complete("reference");
+    let sweep = street.fail(4);
+    let failed = street.run("labels", &[]);
     assert_eq!(failed.code, 75, "{}", failed.stderr);
-    let names: Vec<String> = labels(&folder.join("labels")).into_keys().collect();
+    let names: Vec<String> = street.labels("labels").into_keys().collect();
     assert_eq!(
         names,
         [0, 1, 2].map(|sweep| format!("d0/sweep_{sweep:04}.npz"))
     );
-    drop(socket);
-    fs::remove_file(&sweep).expect("there");
-    fs::write(&sweep, &bytes).expect("writable");
-    let again = tracked("labels");
-    assert_eq!(again.code, 0, "{}", again.stderr);
-    let [reference, found] = ["reference", "labels"].map(|name| labels(&folder.join(name)));
-    assert_same(&found, &reference);
+    sweep.mend();
+    street.complete("labels");
+    assert_same(&street.labels("labels"), &street.labels("reference"));
 }
 
 #[test]

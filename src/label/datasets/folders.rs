@@ -33,6 +33,7 @@ fn is_asked_for(folder: &str, dataset: Dataset) -> bool {
 fn name(folder: &str) -> String {
     let ends = [AV2_SWEEPS, KITTI_SWEEPS[0], KITTI_SWEEPS[1]];
     let bare = ends.into_iter().find_map(|end| folder.strip_suffix(end));
+    let bare = bare.filter(|bare| bare.is_empty() || bare.ends_with('/'));
     drive_name(bare.unwrap_or(folder))
 }
 
@@ -127,6 +128,7 @@ mod tests {
                 "2011_09_26/2011_09_26_drive_0005_sync",
             ),
             ("sequences/04/velodyne", "sequences/04"),
+            ("left_velodyne", "left_velodyne"),
             ("my drives/7", "my_drives/7"),
             ("", ""),
         ] {

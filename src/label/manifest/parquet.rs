@@ -101,7 +101,7 @@ fn take(
                 let values = list.as_primitive_opt::<arrow_array::types::Float64Type>();
                 let values = values.ok_or_else(other)?;
                 if arrow_array::Array::null_count(values) > 0 {
-                    let text = format!("row {}: a number of {name} is missing", first + row);
+                    let text = format!("row {}: a number of {name} is missing", first + row + 1);
                     return Err(ManifestError::Unreadable(text));
                 }
                 Ok(serde_json::to_string(&values.values()[..]).unwrap_or_default())
