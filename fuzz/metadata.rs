@@ -45,7 +45,7 @@ pub(crate) fn calibration(bytes: &[u8]) -> Corpus {
     if let Ok(poses) = read_poses(text, &sweeps) {
         assert!(poses.len() == sweeps.len() && poses.iter().all(is_rigid));
     }
-    if let Ok(file) = PoseFile::open(text.to_vec()) {
+    if let Ok(file) = PoseFile::open(text) {
         let _refused = (file.pose(0, sweeps[0]), file.check_count(2));
     }
     Corpus::Keep

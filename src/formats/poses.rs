@@ -3,8 +3,6 @@
 //! A pose is `world_from_frame`. The ego motion between two sweeps is
 //! `world_from_target.inv_mul(&world_from_source)`.
 
-use std::collections::HashMap;
-
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 
 use super::camera::with_last_row;
@@ -17,7 +15,7 @@ use crate::flow::RigidTransform;
 
 const KIND: FileKind = FileKind::Poses;
 
-/// Largest number of poses in one text file.
+/// Largest number of poses in one file.
 const MAX_POSES: usize = 1_000_000;
 
 /// Tolerance of a stored quaternion's length from 1; float32 ones are within 1e-6.
@@ -55,11 +53,12 @@ const AV2_COLUMNS: [&str; 7] = ["qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"];
 /// - `Missing` for feather, where no row has the time of a sweep, or a column is missing.
 /// - `Motion` for a pose of feather whose quaternion's length is not within 1e-3 of 1, or whose
 ///   translation is not finite.
-/// - `TooLarge` for a text of more than a million poses, or a feather file of more than
-///   [`super::MAX_POINTS`] rows or of far more rows than its size can hold.
+/// - `TooLarge` for more than a million poses, or a feather file of far more rows than its size can
+///   hold.
 pub fn read_poses(bytes: &[u8], sweeps: &[&str]) -> Result<Vec<RigidTransform>, FormatError> {
     if bytes.starts_with(feather::MAGIC) {
-        return read_av2(bytes, sweeps);
+        let poses = TimedPoses::read(bytes)?;
+        return sweeps.iter().map(|sweep| poses.pose(sweep)).collect();
     }
     let poses = read_list(bytes)?;
     let chosen: Option<Vec<&[[f64; 4]; 4]>> = if poses.len() == sweeps.len() {
@@ -78,23 +77,25 @@ pub fn read_poses(bytes: &[u8], sweeps: &[&str]) -> Result<Vec<RigidTransform>, 
 /// A file of poses from which the poses of a sequence are taken sweep by sweep, where the number of
 /// sweeps is not known in advance. Text and JSON have exactly one pose for every sweep, in order; see
 /// [`read_poses`] for the formats.
-pub enum PoseFile {
+pub struct PoseFile(Poses);
+
+enum Poses {
     /// Matrices of text or JSON, in the order of the sweeps.
     Listed(Vec<[[f64; 4]; 4]>),
-    /// The bytes of Argoverse 2's table.
-    Timed(Vec<u8>),
+    /// Argoverse 2's table.
+    Timed(TimedPoses),
 }
 
 impl PoseFile {
-    /// Reads text or JSON; a table is read by [`Self::pose`].
+    /// Reads the poses.
     ///
     /// # Errors
-    /// `Malformed` and `TooLarge` as for [`read_poses`].
-    pub fn open(bytes: Vec<u8>) -> Result<Self, FormatError> {
-        if bytes.starts_with(feather::MAGIC) {
-            return Ok(Self::Timed(bytes));
-        }
-        Ok(Self::Listed(read_list(&bytes)?))
+    /// Those of [`read_poses`] that concern the whole file.
+    pub fn open(bytes: &[u8]) -> Result<Self, FormatError> {
+        Ok(Self(match bytes.starts_with(feather::MAGIC) {
+            true => Poses::Timed(TimedPoses::read(bytes)?),
+            false => Poses::Listed(read_list(bytes)?),
+        }))
     }
 
     /// The pose `world_from_frame` of the sweep with index `index` from 0, whose file name is
@@ -103,9 +104,9 @@ impl PoseFile {
     /// # Errors
     /// As for [`read_poses`]; `RowCount` where there is no pose with that index.
     pub fn pose(&self, index: usize, sweep: &str) -> Result<RigidTransform, FormatError> {
-        match self {
-            Self::Timed(bytes) => Ok(read_av2(bytes, &[sweep])?[0]),
-            Self::Listed(poses) => match poses.get(index) {
+        match &self.0 {
+            Poses::Timed(poses) => poses.pose(sweep),
+            Poses::Listed(poses) => match poses.get(index) {
                 Some(rows) => rigid_pose(sweep, rows),
                 None => Err(wrong_count(poses.len(), index + 1)),
             },
@@ -117,8 +118,8 @@ impl PoseFile {
     /// # Errors
     /// `RowCount` where text or JSON has another number of poses.
     pub fn check_count(&self, sweeps: usize) -> Result<(), FormatError> {
-        match self {
-            Self::Listed(poses) if poses.len() != sweeps => Err(wrong_count(poses.len(), sweeps)),
+        match &self.0 {
+            Poses::Listed(poses) if poses.len() != sweeps => Err(wrong_count(poses.len(), sweeps)),
             _ => Ok(()),
         }
     }
@@ -182,61 +183,69 @@ fn read_text(bytes: &[u8]) -> Result<Vec<[[f64; 4]; 4]>, FormatError> {
     Ok(poses)
 }
 
-fn read_av2(bytes: &[u8], sweeps: &[&str]) -> Result<Vec<RigidTransform>, FormatError> {
-    let table = Table::open(bytes)?;
-    let time = |frame: &&str| {
-        // Nanoseconds in float64, as `Table::each` gives them.
-        let in_nanoseconds = |time: &SweepTime| time.unit == TimeUnit::Nanoseconds;
-        let stamp = SweepTime::from_name(frame).filter(in_nanoseconds);
-        let stamp = stamp.map(|time| time.ticks);
-        // A clock that began later has fewer digits.
-        let stamp = stamp.or_else(|| stem(frame).parse().ok());
-        stamp.map(|time| time as f64).ok_or_else(|| {
-            FileKind::Feather.unsupported(format!(
-                "poses are found by time stamp, and the sweep {} is not named by one",
-                shorten(frame)
-            ))
-        })
-    };
-    let times: Vec<f64> = sweeps.iter().map(time).collect::<Result<_, _>>()?;
-    let mut found: HashMap<u64, Option<usize>> =
-        times.iter().map(|time| (time.to_bits(), None)).collect();
-    table.each("timestamp_ns", |row, stamp| {
-        if let Some(found) = found.get_mut(&stamp.to_bits()) {
-            found.get_or_insert(row);
+/// The rows of Argoverse 2's table in the order of their times.
+struct TimedPoses {
+    /// The time, nanoseconds, and the values of [`AV2_COLUMNS`].
+    rows: Vec<(f64, [f64; 7])>,
+}
+
+impl TimedPoses {
+    fn read(bytes: &[u8]) -> Result<Self, FormatError> {
+        let table = Table::open(bytes)?;
+        if table.rows() > MAX_POSES {
+            return Err(FileKind::Feather.too_large(format!("more than {MAX_POSES} poses")));
         }
-        Ok(())
-    })?;
-    let mut values: HashMap<usize, [f64; 7]> = found
-        .values()
-        .flatten()
-        .map(|&row| (row, [0.0; 7]))
-        .collect();
-    for (column, name) in AV2_COLUMNS.into_iter().enumerate() {
-        table.each(name, |row, value| {
-            if let Some(values) = values.get_mut(&row) {
-                values[column] = value;
-            }
+        // Numbers of real poses hardly compress: a row takes more than a quarter of its memory.
+        let (size, rows) = (bytes.len(), table.rows());
+        if rows > size / (size_of::<(f64, [f64; 7])>() / 4) {
+            return Err(FileKind::Feather.too_large(format!("{size} bytes claim {rows} poses")));
+        }
+        let mut rows = vec![(0.0, [0.0; 7]); rows];
+        table.each("timestamp_ns", |row, stamp| {
+            rows[row].0 = stamp;
             Ok(())
         })?;
+        for (column, name) in AV2_COLUMNS.into_iter().enumerate() {
+            table.each(name, |row, value| {
+                rows[row].1[column] = value;
+                Ok(())
+            })?;
+        }
+        // Stable: of rows with one time the first one counts.
+        rows.sort_by(|a, b| a.0.total_cmp(&b.0));
+        Ok(Self { rows })
     }
-    let pose = |(frame, time): (&&str, &f64)| {
-        let row = found.get(&time.to_bits()).copied().flatten();
-        let Some(values) = row.and_then(|row| values.get(&row)) else {
-            let present = [format!("{} poses of other times", table.rows())];
-            let what = format!("a pose at the time of {}", shorten(frame));
+
+    fn pose(&self, sweep: &str) -> Result<RigidTransform, FormatError> {
+        // Nanoseconds in float64, as `Table::each` gives them.
+        let in_nanoseconds = |time: &SweepTime| time.unit == TimeUnit::Nanoseconds;
+        let stamp = SweepTime::from_name(sweep).filter(in_nanoseconds);
+        let stamp = stamp.map(|time| time.ticks);
+        // A clock that began later has fewer digits.
+        let stamp = stamp.or_else(|| stem(sweep).parse().ok());
+        let Some(time) = stamp.map(|stamp| stamp as f64) else {
+            return Err(FileKind::Feather.unsupported(format!(
+                "poses are found by time stamp, and the sweep {} is not named by one",
+                shorten(sweep)
+            )));
+        };
+        let first = self
+            .rows
+            .partition_point(|row| row.0.total_cmp(&time).is_lt());
+        let Some((_, values)) = self.rows.get(first).filter(|row| row.0 == time) else {
+            let present = [format!("{} poses of other times", self.rows.len())];
+            let what = format!("a pose at the time of {}", shorten(sweep));
             return Err(FileKind::Feather.missing(what, &present));
         };
-        let [w, x, y, z, array_path @ ..] = *values;
+        let [w, x, y, z, translation @ ..] = *values;
         let rotation = Quaternion::new(w, x, y, z);
         let is_unit = (rotation.norm() - 1.0).abs() <= UNIT_TOLERANCE;
-        if !is_unit || array_path.iter().any(|metres| !metres.is_finite()) {
+        if !is_unit || translation.iter().any(|metres| !metres.is_finite()) {
             return Err(FormatError::Motion("a pose is not a rigid transform"));
         }
         Ok(RigidTransform::from_parts(
-            Translation3::from(array_path),
+            Translation3::from(translation),
             UnitQuaternion::from_quaternion(rotation),
         ))
-    };
-    sweeps.iter().zip(&times).map(pose).collect()
+    }
 }

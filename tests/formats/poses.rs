@@ -106,9 +106,13 @@ fn av2(times: &[i64], poses: &[RigidTransform]) -> Vec<u8> {
         ("tz_m", float(&|pose| pose.translation.z)),
     ])
     .unwrap();
+    written(&batch)
+}
+
+fn written(batch: &arrow_array::RecordBatch) -> Vec<u8> {
     let mut bytes = Vec::new();
     let mut writer = arrow_ipc::writer::FileWriter::try_new(&mut bytes, &batch.schema()).unwrap();
-    writer.write(&batch).unwrap();
+    writer.write(batch).unwrap();
     writer.finish().unwrap();
     drop(writer);
     bytes
@@ -131,6 +135,12 @@ fn argoverse_poses_are_found_by_time_stamp() {
     // As ROS writes times.
     let found = read_poses(&file, &["scan_0315966265.259845000.pcd"]).unwrap();
     assert!(difference(&found[0], &pose(9)) < SINGLE);
+    // A clock in nanoseconds that began later has fewer digits than one that began in 1970.
+    for time in [1_700_000_000_000, 1_700_000_000_000_000] {
+        let late = av2(&[time - 1000, time], &poses[..2]);
+        let found = read_poses(&late, &[&format!("{time}.feather")]).unwrap();
+        assert!(difference(&found[0], &pose(1)) < SINGLE);
+    }
     let told = refusal(&file, &["315966265259800000.feather"]);
     assert!(
         told.contains("lacks a pose at the time of 315966265259800000.feather"),
@@ -143,6 +153,26 @@ fn argoverse_poses_are_found_by_time_stamp() {
         nalgebra::UnitQuaternion::new_unchecked(nalgebra::Quaternion::new(0.5, 0.0, 0.0, 0.0));
     let told = refusal(&av2(&times, &broken), &sweeps);
     assert!(told.contains("not a rigid transform"), "{told}");
+}
+
+#[test]
+fn a_table_of_more_poses_than_its_bytes_can_hold_is_refused() {
+    use arrow_array::{ArrayRef, BooleanArray, RecordBatch};
+    let bits: ArrayRef = std::sync::Arc::new(BooleanArray::from(vec![true; 100_000]));
+    let columns = [
+        "timestamp_ns",
+        "qw",
+        "qx",
+        "qy",
+        "qz",
+        "tx_m",
+        "ty_m",
+        "tz_m",
+    ];
+    let columns = columns.map(|name| (name, bits.clone()));
+    let file = written(&RecordBatch::try_from_iter(columns).unwrap());
+    let told = refusal(&file, &["1.feather"]);
+    assert!(told.contains("bytes claim 100000 poses"), "{told}");
 }
 
 /// Two rows of three cells of half a metre, with the corner at (10, 20). One cell is unknown, one

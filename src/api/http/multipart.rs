@@ -158,7 +158,7 @@ impl Body {
             "poses" => {
                 self.has_poses = true;
                 let bytes = reading.whole(field, MAX_POSES).await?;
-                let read = move || PoseFile::open(bytes).map_err(bad_poses);
+                let read = move || PoseFile::open(&bytes).map_err(bad_poses);
                 Ok(Some(Part::Poses(self.timed(read).await?)))
             }
             "source" | "target" | "sweep" => {
