@@ -331,10 +331,8 @@ impl Surroundings {
         options.newest_first = self.interval_s(pair).is_some_and(f32::is_sign_negative);
         if let Some(poses) = &self.poses {
             options.ego = Ego::Given(poses[target].inv_mul(&poses[source]));
-        } else if source > target
-            && let Ego::Given(motion) = &mut options.ego
-        {
-            *motion = motion.inverse();
+        } else if source > target {
+            options.ego = options.ego.reversed();
         }
         options
     }

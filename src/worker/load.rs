@@ -78,11 +78,9 @@ impl Worker {
         let mut solver = options.solver_options(points);
         if let Some((source, target)) = source.pose.zip(target.pose) {
             solver.ego = Ego::Given(target.inv_mul(&source));
-        } else if job.backward
-            && let Ego::Given(target_from_source) = &mut solver.ego
-        {
+        } else if job.backward {
             // The given ego motion is from the earlier sweep to the later one.
-            *target_from_source = target_from_source.inverse();
+            solver.ego = solver.ego.reversed();
         }
         let work = Work {
             options: solver,

@@ -44,6 +44,9 @@ fn fields(
             let mut solver = solver_options(&options, counts);
             if let Some(poses) = poses {
                 solver.ego = ego(poses, [before, index]);
+            } else if before > index {
+                // The given ego motion is from the earlier sweep to the later one.
+                solver.ego = solver.ego.reversed();
             }
             place.run(py, &watch, None, |backend| {
                 sequence.push(backend, sweeps[index].clone(), &solver, &watch)
@@ -79,6 +82,10 @@ pub(crate) fn densify<'py>(
         .densify
         .ok_or_else(|| input("densify needs a reference_time"))?;
     let plan = asked.plan(sweeps.len()).map_err(input)?;
+    options.check_for_sequence(sweeps.len()).map_err(input)?;
+    if poses.is_some() {
+        options.check_for_poses().map_err(input)?;
+    }
     let poses = poses.map(|poses| {
         if poses.len() != sweeps.len() {
             let (poses, sweeps) = (poses.len(), sweeps.len());

@@ -4,10 +4,10 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
 
 use fnsf::flow::field::Backend;
-use fnsf::flow::tracks::{Tracker, push_and_correct};
-use fnsf::flow::{self, Ego, Estimate, FlowError, Point, Sweep};
+use fnsf::flow::tracks::{TrackError, Tracker, push_and_correct};
+use fnsf::flow::{self, Ego, Estimate, FlowError, Method, Point, Sweep};
 use fnsf::formats::{SweepClock, pair_interval_s};
-use fnsf::job::JobOptions;
+use fnsf::job::{EgoChoice, JobOptions};
 use pyo3::prelude::*;
 use pyo3::types::PyList;
 
@@ -117,6 +117,12 @@ impl Sequence {
         track: bool,
     ) -> PyResult<Self> {
         let options = options_of(options)?;
+        if matches!(options.ego, Some(EgoChoice::Given(_))) {
+            return Err(input("ego is the motion of one pair: give it to push"));
+        }
+        if track && !matches!(options.solver_options(0).method, Method::Objects(_)) {
+            return Err(input(TrackError::NoObjects));
+        }
         Ok(Self(Mutex::new(State {
             place: Place::open(py, device, threads, options)?,
             sequence: flow::Sequence::default(),
@@ -175,6 +181,9 @@ impl Sequence {
         let mut solver = options.solver_options(larger);
         if let Some(ego) = ego {
             solver.ego = Ego::Given(motion("ego", &ego)?);
+        }
+        if state.tracker.is_some() && state.last.is_some() && solver.ego == Ego::Off {
+            return Err(input(TrackError::NoEgoMotion));
         }
         let time_s = match state.last {
             Some(_) => state.time_s + f64::from(solver.dt_s),

@@ -11,7 +11,7 @@ use fnsf::flow::{Control, Interrupt, Progress};
 use pyo3::prelude::*;
 
 use crate::device::cpu;
-use crate::errors::{input, internal};
+use crate::errors::{DeviceError, input, internal};
 
 /// How often signals are looked for and progress is passed on.
 const LOOK: Duration = Duration::from_millis(50);
@@ -114,7 +114,7 @@ pub(crate) fn supervised<T: Send>(
                     // The receiver waits until the work has ended.
                     let _ = done.send(work());
                 })
-                .map_err(internal)?;
+                .map_err(|error| DeviceError::new_err(error.to_string()))?;
             let mut stopped = None;
             loop {
                 match result.recv_timeout(LOOK) {

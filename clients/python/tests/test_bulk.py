@@ -47,6 +47,15 @@ def test_rows_that_cannot_be_used_are_refused(table, tmp_path):
         Labeller("x", ending="obj")
 
 
+def test_a_pair_whose_fit_diverges_is_refused(table, tmp_path):
+    labeller = Labeller(
+        str(tmp_path / "labels"), preset="nsfp-baseline", field={"learning_rate": 1e30, "max_iterations": 20}
+    )
+    report = labeller(table)
+    assert list(report["outcome"]) == ["refused"] * 3
+    assert all("diverged" in error for error in report["error"])
+
+
 @pytest.mark.parametrize(
     ("options", "error", "said"),
     [

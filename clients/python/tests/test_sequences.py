@@ -88,6 +88,24 @@ def test_times_of_points_give_the_time_between_sweeps():
         assert found.report["dt_s"] == pytest.approx(duration) and duration > 0.05
 
 
+def test_neighbor_sweeps_lie_at_their_times_where_a_sweep_is_missing(program, street, tmp_path):
+    kept = [index for index in range(len(street)) if index != 2]
+    paths = [tmp_path / f"{1_700_000_000_000 + 100 * index}.pcd" for index in kept]
+    sequence, even, flows, flows_of_even = fnsf.Sequence(), fnsf.Sequence(), [], []
+    for index, before, path in zip(kept, [0, *kept], paths, strict=False):
+        points = street.sweep(index).points
+        fnsf.write(path, points)
+        flows += sequence.push(points, dt_s=0.1 * (index - before) or None)
+        flows_of_even += even.push(points, dt_s=0.1)
+    flows += sequence.finish()
+    flows_of_even += even.finish()
+    command = [program, "flow", *paths, "--preset", "label", "-o", tmp_path / "flow.npz"]
+    subprocess.run(command, check=True, capture_output=True)
+    for index, flow in enumerate(flows):
+        assert np.array_equal(flow.flow, fnsf.read_flow(tmp_path / f"flow_{index:04}.npz").flow)
+    assert any(not np.array_equal(one.flow, other.flow) for one, other in zip(flows, flows_of_even, strict=True))
+
+
 def test_a_dense_cloud_has_the_bits_of_the_command_line(program, street, files, tmp_path):
     command = [program, "densify", *files[:4], "--reference-time", "1.5", "-o", tmp_path / "dense.npz"]
     subprocess.run(command, check=True, capture_output=True)
@@ -101,6 +119,33 @@ def test_a_dense_cloud_has_the_bits_of_the_command_line(program, street, files, 
     for ending in ["npz", "ply", "pcd", "laz", "las"]:
         cloud.save(tmp_path / f"dense.{ending}")
         assert (tmp_path / f"dense.{ending}").stat().st_size > len(cloud)
+
+
+def test_a_given_ego_motion_of_two_sweeps_leads_a_dense_cloud_back_as_well(street):
+    pair = street.pair(0)
+    found = fnsf.densify([pair.source, pair.target], 0)
+    given = fnsf.densify([pair.source, pair.target], 0, ego=pair.ego)
+    # The sensor moves by a metre.
+    assert np.linalg.norm(found.points[:, :2] - given.points[:, :2], axis=1).mean() < 0.1
+
+
+def test_what_no_sequence_can_be_asked_is_refused(street):
+    pair, third = street.pair(0), street.sweep(2).points
+    poses = [street.pose(index) for index in range(2)]
+    for refused in [
+        lambda: fnsf.densify([pair.source, pair.target, third], 0, ego=pair.ego),
+        lambda: fnsf.densify([pair.source, pair.target], 0, poses=poses, ego="off"),
+        lambda: fnsf.Sequence(ego=pair.ego),
+        lambda: fnsf.Sequence(track=True, preset="neural"),
+    ]:
+        with pytest.raises(fnsf.InputError):
+            refused()
+    sequence = fnsf.Sequence(track=True, preset="default", ego="off")
+    sequence.push(pair.source)
+    with pytest.raises(fnsf.InputError, match="tracks need the ego motion"):
+        sequence.push(pair.target)
+    # The motion of the pair may be given later.
+    assert len(sequence.push(pair.target, ego=pair.ego)) == 1
 
 
 def test_poses_lead_a_dense_cloud(street):

@@ -8,7 +8,7 @@ use crate::flow::data::RigidTransform;
 pub const DEFAULT_DT_S: f32 = 0.1;
 
 /// Least overlap of a pair, 0 to 1. Sweeps of one scene have 0.64 or more, half a second apart and
-/// with 16 beams as well. Sweeps of two scenes have 0.26 at most (`docs/experiments/overlap.md`).
+/// with 16 beams as well. Sweeps of two scenes have 0.25 at most (`docs/experiments/overlap.md`).
 pub const LEAST_OVERLAP: f32 = 0.35;
 /// Overlap from which the alignment counts as certain. Between the two the confidence falls.
 pub const CERTAIN_OVERLAP: f32 = 0.6;
@@ -142,4 +142,15 @@ pub enum Ego {
     /// Given as target_from_source; the pair is not registered. The method estimates the residual
     /// motion.
     Given(RigidTransform),
+}
+
+impl Ego {
+    /// The ego motion of the pair with its sweeps exchanged.
+    #[must_use]
+    pub fn reversed(self) -> Self {
+        match self {
+            Self::Given(motion) => Self::Given(motion.inverse()),
+            other => other,
+        }
+    }
 }

@@ -33,14 +33,15 @@ PART = r"[^/\\?#\x00-\x1f\x7f]{1,200}"
 KEY = re.compile(rf"{PART}(/{PART}){{0,19}}")
 """Parts of up to 200 letters, without what has a meaning in a URI."""
 REFUSED = (
-    _native.InputError,
+    _native.Error,
     ValueError,
     FileExistsError,
     FileNotFoundError,
     IsADirectoryError,
     NotADirectoryError,
 )
-"""What another try does not mend. Other errors are those of a disk or a network: the engine tries again."""
+"""Errors that occur again when the pair is tried again; `DeviceError` is excepted. Other errors are those of a disk or a
+network: the engine tries again."""
 # Other schemes, and Azure's other ways to name a server, would send the credentials of this machine there.
 AUTHORITY = {
     "file": re.compile(""),
@@ -101,6 +102,8 @@ class Labeller:
                 options = options | {"dt_s": abs(apart)}
             found = flow(first.points, second.points, times=times, **options)
             written = _put_new(filesystem, path, found.to_bytes(self._ending))
+        except _native.DeviceError:
+            raise
         except REFUSED as error:
             return report | {"outcome": "refused", "error": str(error)}
         return report | {

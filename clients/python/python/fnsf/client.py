@@ -5,7 +5,7 @@
     job = client.submit([pc1, pc2], labels={"drive": "7"})
     flow = client.result(client.wait(job.id).id)
 
-Needs grpcio and protobuf: `pip install fnsf[client]`.
+Needs grpcio and protobuf: `pip install './clients/python[client]'` in a checkout of the project.
 """
 
 from __future__ import annotations
