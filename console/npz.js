@@ -26,7 +26,7 @@ const TYPES = {
  * @param {string[]} wanted The names of the arrays, without `.npy`.
  * @returns {Promise<Object<string, TypedArray>>} The arrays that the file has, by name, flat and in
  *   the order of C.
- * @throws {Error} If the file is damaged or an array has another type of value.
+ * @throws {Error} If the file is damaged, or an array has another type of value or its columns first.
  */
 export async function readNpz(file, wanted) {
   const view = new DataView(file);
@@ -36,6 +36,11 @@ export async function readNpz(file, wanted) {
     if (wanted.includes(name)) arrays[name] = readNpy(await content(view, entry));
   }
   return arrays;
+}
+
+/** The values of an array as Float32Array, whatever numbers they are. */
+export function floats(array) {
+  return array instanceof Float32Array ? array : Float32Array.from(array, Number);
 }
 
 /** The entries of the central directory. */
@@ -97,5 +102,7 @@ function readNpy(file) {
   const type = /'descr': *'([^']+)'/.exec(header)?.[1];
   const values = TYPES[type];
   if (!values) throw new Error(`an array has the type ${type}`);
+  const isTable = /'shape': *\([^)]*\d *, *\d/.test(header);
+  if (isTable && /'fortran_order': *True/.test(header)) throw new Error("an array has its columns first (Fortran order)");
   return new values(file.slice(start + length));
 }

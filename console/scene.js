@@ -4,7 +4,7 @@
  */
 
 import { buffer, json } from "./api.js";
-import { readNpz } from "./npz.js";
+import { floats, readNpz } from "./npz.js";
 
 /** Number of sweeps and of flows that are kept. */
 const KEPT = 12;
@@ -156,7 +156,10 @@ export class Scene {
   async #loadDense() {
     if (!this.#described.dense) return null;
     const file = await buffer(this.#described.dense, NPZ);
-    return readNpz(file, ["points", "sweep", "age", "dynamic"]);
+    const arrays = await readNpz(file, ["points", "sweep", "age", "dynamic"]);
+    // Another program may have saved a file of this machine with other types.
+    for (const name of Object.keys(arrays)) arrays[name] = name === "dynamic" ? arrays[name] : floats(arrays[name]);
+    return arrays;
   }
 }
 

@@ -81,8 +81,10 @@ export function addTrajectories(lines, objects, tracks, sweep, egoOf) {
     poses.set(past, pose);
   }
   for (const object of objects) {
-    const { states } = tracks.find((track) => track.id === object.id);
-    const past = states.filter((state) => state.sweep <= sweep && poses.has(state.sweep));
+    // Objects that were made before the tracks came have no track.
+    const track = tracks.find(({ id }) => id === object.id);
+    if (!track) continue;
+    const past = track.states.filter((state) => state.sweep <= sweep && poses.has(state.sweep));
     const places = past.map((state) => poses.get(state.sweep)?.(state.center) ?? state.center);
     for (let index = 1; index < places.length; index += 1) lines.add(places[index - 1], places[index], object.color, 0.8);
   }

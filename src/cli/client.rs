@@ -143,11 +143,13 @@ impl Client {
         mut tell: impl FnMut(&str, &Value),
     ) -> anyhow::Result<()> {
         let mut response = self.send(self.request(Method::GET, path)?).await?;
-        let mut text = String::new();
+        let mut bytes = Vec::new();
         while let Some(piece) = response.chunk().await? {
-            text.push_str(&String::from_utf8_lossy(&piece));
-            while let Some(end) = text.find("\n\n") {
-                let event: String = text.drain(..end + 2).collect();
+            bytes.extend_from_slice(&piece);
+            // A piece may end within a character; an event does not.
+            while let Some(end) = bytes.windows(2).position(|two| two == b"\n\n") {
+                let event: Vec<u8> = bytes.drain(..end + 2).collect();
+                let event = String::from_utf8_lossy(&event);
                 let field = |key: &str| {
                     let mut lines = event.lines();
                     lines.find_map(|line| Some(line.strip_prefix(key)?.trim_start()))

@@ -11,7 +11,7 @@ use indicatif::ProgressBar;
 
 use super::failure::Failure;
 use super::files;
-use super::output::say;
+use super::output::{complain, say};
 use super::terminal::bar;
 use crate::flow::RigidTransform;
 use crate::formats::{
@@ -137,6 +137,9 @@ impl Export {
                 self.clouds(layout, &names)?
             }
         };
+        if clouds > 0 {
+            self.warn_of_times()?;
+        }
         let boxes: usize = tracks.iter().map(|track| track.states.len()).sum();
         let clouds = match clouds {
             0 => String::new(),
@@ -149,6 +152,21 @@ impl Export {
             grouped(names.len()),
             self.output.display()
         ))
+    }
+
+    /// Warns where the boxes may be those of deskewed sweeps: the points of the files lie elsewhere.
+    fn warn_of_times(&self) -> Result<(), Failure> {
+        let [first, ..] = self.sweeps.as_slice() else {
+            return Ok(());
+        };
+        if files::read_timed_cloud(first)?.times.is_some() {
+            complain(format_args!(
+                "warning: the points of these sweeps have times. If the tracks are those of deskewed sweeps, their boxes \
+                 lie beside the points at high speed: fnsf label --ignore-times and fnsf flow --deskew off make tracks \
+                 that fit"
+            ));
+        }
+        Ok(())
     }
 
     /// Refuses options of other layouts.

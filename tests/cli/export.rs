@@ -380,3 +380,24 @@ fn no_input_is_written_over_and_a_cloud_in_its_place_stays() {
     assert!(done.stderr.contains("written over"), "{}", done.stderr);
     assert_eq!(fs::read(folder.join("scene.mcap")).expect("tracks"), tracks);
 }
+
+#[test]
+fn boxes_beside_points_that_have_times_come_with_a_warning() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    for (rolling, has_times) in [(&[][..], false), (&["--rolling"], true)] {
+        let size = ["synth", "-o", ".", "--beams", "8", "--sweeps", "4"];
+        let made = fnsf(folder, &[&size[..], rolling].concat());
+        assert_eq!(made.code, 0, "{}", made.stderr);
+        let sweeps = sweeps();
+        let sweeps: Vec<&str> = sweeps.iter().map(String::as_str).collect();
+        let options = ["--layout", "supervisely", "-o", "project"];
+        let done = fnsf(
+            folder,
+            &[&["export", "tracks.json"], &sweeps[..], &options].concat(),
+        );
+        assert_eq!(done.code, 0, "{}", done.stderr);
+        let warned = done.stderr.contains("--ignore-times");
+        assert_eq!(warned, has_times, "{}", done.stderr);
+    }
+}

@@ -204,6 +204,28 @@ fn a_sweep_that_is_being_written_at_the_start_is_taken_when_it_is_complete() {
 }
 
 #[test]
+fn a_sweep_that_is_closed_several_times_is_taken_once() {
+    let folder = prepared("4");
+    let folder = folder.path();
+    let put = |number: usize| {
+        let path = folder.join(format!("incoming/{number}.pcd"));
+        std::fs::write(&path, sweep(folder, number)).expect("written");
+        for _ in 0..3 {
+            let opened = std::fs::OpenOptions::new().append(true).open(&path);
+            drop(opened.expect("there"));
+        }
+    };
+    (0..2).for_each(put);
+    let child = follow(folder, &["--dt", "0.1"]);
+    await_file(&folder.join("flows/flow_0000.npz"));
+    (2..4).for_each(put);
+    let (output, reports, stderr) = ended(child);
+    assert!(output.status.success(), "{stderr}");
+    let expected = [["0.pcd", "1.pcd"], ["1.pcd", "2.pcd"], ["2.pcd", "3.pcd"]];
+    assert_eq!(names(&reports), expected);
+}
+
+#[test]
 fn a_flow_that_is_due_before_it_is_found_is_the_best_one_until_then() {
     let folder = prepared("4");
     let folder = folder.path();

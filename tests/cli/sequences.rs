@@ -256,7 +256,20 @@ fn what_no_sequence_can_be_asked_is_refused_with_advice() {
     let ego = "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n";
     std::fs::write(folder.join("ego.txt"), ego).expect("written");
     let [a, b, c, _] = SWEEPS;
-    let refused: [(&[&str], i32, &str); 6] = [
+    let refused: [(&[&str], i32, &str); 7] = [
+        (
+            &[
+                "densify",
+                a,
+                b,
+                "--reference-time",
+                "0",
+                "--picture",
+                "x.jpg",
+            ],
+            2,
+            "ends in .png",
+        ),
         (
             &["densify", a, b, "--reference-time", "2", "-o", "x.ply"],
             2,

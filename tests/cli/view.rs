@@ -123,6 +123,27 @@ fn sweeps_are_shown_with_the_flow_that_is_estimated_and_their_tracks() {
     }
 }
 
+#[test]
+fn a_dense_cloud_takes_no_argument_of_sweeps() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    street(folder, "2");
+    let [a, b] = [0, 1].map(|at| format!("street/sweep_000{at}.pcd"));
+    let dense = ["--reference-time", "0", "-o", "dense.npz"];
+    let made = fnsf(folder, &[&["densify", &a, &b], &dense[..]].concat());
+    assert_eq!(made.code, 0, "{}", made.stderr);
+    for more in [
+        ["--flow", "flow.npz"],
+        ["--tracks", "tracks.json"],
+        ["--poses", "poses.txt"],
+    ] {
+        let refused = fnsf(folder, &[&["view", "dense.npz"], &more[..]].concat());
+        assert_eq!(refused.code, 2, "{more:?}");
+        let said = "a dense cloud is shown alone";
+        assert!(refused.stderr.contains(said), "{}", refused.stderr);
+    }
+}
+
 /// An array as numpy writes it: `kind` of the values, and whether the columns come first.
 fn npy(kind: &str, columns_first: bool, shape: &str, values: &[u8]) -> Vec<u8> {
     let order = if columns_first { "True" } else { "False" };

@@ -55,6 +55,19 @@ fn sweeps_are_submitted_and_jobs_listed_shown_cancelled_requeued_and_removed() {
     run(&["submit", "a.pcd", "b.pcd", "c.pcd", "-o", "flows.zip"]);
     let zip = std::fs::read(folder.path().join("flows.zip")).expect("flows");
     assert!(zip.starts_with(b"PK"));
+    // A dense cloud of two sweeps.
+    let dense = r#"{"densify": {"reference_time": 1}}"#;
+    run(&[
+        "submit",
+        "a.pcd",
+        "b.pcd",
+        "--options",
+        dense,
+        "-o",
+        "dense.npz",
+    ]);
+    let dense = std::fs::read(folder.path().join("dense.npz")).expect("a dense cloud");
+    assert!(fnsf::formats::is_dense(&dense));
 
     // A job that lasts, one behind it, and their cancellation.
     let long = r#"{"field": {"max_iterations": 1000000, "patience": 1000000}}"#;

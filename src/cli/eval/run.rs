@@ -93,7 +93,9 @@ impl Eval {
         for (index, name) in names.iter().enumerate() {
             let (flow, truth, pair) = self.read(index)?;
             let mut scores = Scores::default();
-            for scores in [&mut scores, &mut all] {
+            // One flow has no total.
+            let total = (flows > 1).then_some(&mut all);
+            for scores in [Some(&mut scores), total].into_iter().flatten() {
                 let added = scores
                     .add(&flow, &truth, &pair)
                     .with_context(|| name.clone());

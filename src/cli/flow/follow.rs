@@ -103,6 +103,8 @@ pub(super) struct Arrivals {
     /// The sweeps that were there before, each as it was when it was taken. Late events of what was taken are
     /// left alone.
     present: HashMap<PathBuf, Option<Version>>,
+    /// The sweep that was taken last, as it was then: a writer may close it twice.
+    last: Option<(PathBuf, Option<Version>)>,
     idle: Option<Duration>,
     can_be_due: bool,
     warned: Option<Instant>,
@@ -135,6 +137,7 @@ impl Arrivals {
             _watcher: Box::new(watcher),
             present: paths.iter().cloned().map(|path| (path, None)).collect(),
             waiting: paths.into(),
+            last: None,
             idle: arguments.idle_s,
             can_be_due: arguments.due_ms.is_some(),
             warned: None,
@@ -162,6 +165,7 @@ impl Arrivals {
                 if let Some(taken) = self.present.get_mut(&path) {
                     *taken = version;
                 }
+                self.last = Some((path.clone(), version));
                 // A sweep that is gone is refused when it is read.
                 let written = version.map_or_else(SystemTime::now, |(_, written)| written);
                 return Ok(Some(Arrived { path, written }));
@@ -217,6 +221,8 @@ impl Arrivals {
             // It waits, and is complete.
             Some(None) => drop(self.present.remove(&path)),
             Some(taken) if *taken == version(&path) => {}
+            _ if self.waiting.contains(&path) => {}
+            None if self.last == Some((path.clone(), version(&path))) => {}
             _ => self.waiting.push_back(path),
         }
         Ok(())
