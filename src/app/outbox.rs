@@ -1,4 +1,4 @@
-//! The actions that the queue has promised and that lie outside of it: removing the files of forgotten
+//! The actions that the queue has promised and that lie outside of it: removing the files of deleted
 //! jobs, delivering results, and telling webhooks of the end of jobs.
 
 use std::collections::HashMap;
@@ -59,7 +59,7 @@ pub(super) struct Outbox {
     pub(super) service: Arc<Service>,
     pub(super) webhooks: Webhooks,
     pub(super) metrics: Arc<Metrics>,
-    /// Rung when a job has ended or was forgotten.
+    /// Rung when a job has ended or was deleted.
     pub(super) bell: Arc<Notify>,
 }
 
@@ -136,7 +136,7 @@ impl Outbox {
                 match trouble {
                     None => Settled::Done,
                     Some(error) => {
-                        tracing::warn!(error, job = %one.job, "a forgotten job left something behind");
+                        tracing::warn!(error, job = %one.job, "a deleted job left something behind");
                         Settled::Again(delay(one.attempts))
                     }
                 }

@@ -27,7 +27,7 @@ pub enum PresetChoice {
     Paper,
     /// The baseline of FNSF's comparison: a network fitted to the truncated Chamfer distance.
     NsfpBaseline,
-    /// NSFP: as nsfp-baseline, with a second network that leads the points back.
+    /// NSFP: as nsfp-baseline, with a second network for the backward flow.
     Nsfp,
     /// NSFP++: ego motion, then a fit as nsfp for each cluster of points.
     #[serde(rename = "nsfp++")]

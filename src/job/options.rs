@@ -22,7 +22,7 @@ pub struct JobOptions {
     /// points move with the ego motion. `label`: as `default`, and a pair of a sequence uses up to
     /// five sweeps. `neural`: a short, robust fit of a neural field. `paper`: FNSF as published.
     /// `nsfp-baseline`: the baseline that FNSF is compared with, a network fitted to the truncated
-    /// Chamfer distance. `nsfp`: the same with NSFP's second network, which leads the points back.
+    /// Chamfer distance. `nsfp`: the same with NSFP's second network for the backward flow.
     /// `nsfp++`, `nsfp++-dt`: ego motion, then a fit of this kind for each cluster, with the Chamfer
     /// distance or distance transforms. `nsfp-kdtree`: the baseline with k-d trees. `fnsf-linear`, `nsfp-linear`,
     /// `nsfp-kdtree-linear`: FNSF's linear model with the three losses.

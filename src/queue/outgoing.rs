@@ -38,7 +38,7 @@ pub enum Settled {
 /// What an [`Outgoing`] action does.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Action {
-    /// Removes payload, snapshot and result of a job that the queue has forgotten.
+    /// Removes payload, snapshot and result of a job that the queue has deleted.
     RemoveFiles,
     /// Writes the result of a job that has succeeded to the URI of its [`Job::delivery`].
     Deliver(Arc<Job>),

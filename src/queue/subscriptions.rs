@@ -52,7 +52,7 @@ impl Watchers {
         }
     }
 
-    /// The watched jobs. Those without subscribers are forgotten.
+    /// The watched jobs. Those without subscribers are dropped.
     pub(super) fn jobs(&self) -> Vec<JobId> {
         let mut senders = self.lock();
         senders.retain(|_, sender| sender.receiver_count() > 0);

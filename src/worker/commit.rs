@@ -155,7 +155,7 @@ impl Worker {
     }
 
     /// The outcome of a job after a storage failure. If the store probe fails too, the job is
-    /// released without blame. If the store works otherwise, the job is delayed behind the others;
+    /// released, and no attempt is counted. If the store works otherwise, the job is delayed behind the others;
     /// if a blob is missing, the attempt has failed.
     async fn store_failed(
         &self,

@@ -8,10 +8,10 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::{Source, sources};
 
-type Module = Vec<String>;
+pub(super) type Module = Vec<String>;
 
 /// What imports what, by folder: from the node to the nodes that it names.
-type Edges = BTreeMap<Module, BTreeMap<String, BTreeSet<String>>>;
+pub(super) type Edges = BTreeMap<Module, BTreeMap<String, BTreeSet<String>>>;
 
 /// The module of a file: `flow/data/mod.rs` and `flow/data.rs` are both `flow::data`.
 fn module(path: &str) -> Module {
@@ -120,7 +120,7 @@ fn is_for_tests(source: &Source, all: &[Source]) -> bool {
         })
 }
 
-fn edges(all: &[Source]) -> Edges {
+pub(super) fn edges(all: &[Source]) -> Edges {
     let modules: BTreeSet<Module> = all.iter().map(|source| module(&source.path)).collect();
     // The child of a folder that a name of its `mod.rs` comes from.
     let mut re_exports: BTreeMap<(Module, String), String> = BTreeMap::new();

@@ -5,6 +5,7 @@
 mod circles;
 mod dependencies;
 mod docs;
+mod imports;
 mod planted;
 
 use std::fs;

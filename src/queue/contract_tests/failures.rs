@@ -116,10 +116,10 @@ pub(crate) async fn a_crash_keeps_promises_and_forgets_what_nobody_waits_for(
     assert_eq!(state(&queue, &ended).await, State::Succeeded);
     let gone = queue.job(&awaited.tenant, awaited.id).await;
     assert_eq!(gone, Err(QueueError::NotFound));
-    let forgotten = |event: &Event| matches!(event, Event::Deleted(id) if *id == awaited.id);
+    let deleted = |event: &Event| matches!(event, Event::Deleted(id) if *id == awaited.id);
     let mut told = false;
     while let Ok(event) = events.try_recv() {
-        told |= forgotten(&event);
+        told |= deleted(&event);
     }
     assert!(told, "nobody was told to clean up");
     assert_eq!(queue.backlog().queued().jobs, 2);
@@ -174,7 +174,7 @@ pub(crate) async fn a_job_made_durable_survives(stand: &mut impl Stand) {
     assert_eq!(state(&queue, &job).await, State::Queued);
 }
 
-pub(crate) async fn ended_jobs_are_kept_for_a_while_and_then_forgotten(stand: &mut impl Stand) {
+pub(crate) async fn ended_jobs_are_kept_for_a_while_and_then_deleted(stand: &mut impl Stand) {
     let (queue, mut events) = stand
         .open(QueueOptions {
             retention: Duration::from_millis(80),
@@ -184,14 +184,14 @@ pub(crate) async fn ended_jobs_are_kept_for_a_while_and_then_forgotten(stand: &m
     let job = submit(&queue, sequence(1)).await;
     let held = lease(&queue).await;
     finish(&queue, &held.job, done()).await;
-    let mut forgotten = Vec::new();
-    while forgotten.len() < 2 {
+    let mut deleted = Vec::new();
+    while deleted.len() < 2 {
         let event = timeout(PATIENCE, events.recv()).await.expect("in time");
         if let Some(Event::Deleted(id)) = event {
-            forgotten.push(id);
+            deleted.push(id);
         }
     }
-    assert!(forgotten.contains(&job.id) && forgotten.contains(&held.job.id));
+    assert!(deleted.contains(&job.id) && deleted.contains(&held.job.id));
     let gone = queue.job(&job.tenant, job.id).await;
     assert_eq!(gone, Err(QueueError::NotFound));
     let known = queue.known(vec![job.id]).await.expect("an answer");

@@ -69,7 +69,7 @@ macro_rules! queue_contract {
             jobs_are_found_by_their_labels_until_they_are_removed,
             a_pair_says_which_sweeps_it_is_of_and_found_from,
             a_sequence_is_cancelled_with_its_pairs_and_can_be_asked_for_again,
-            ended_jobs_are_kept_for_a_while_and_then_forgotten,
+            ended_jobs_are_kept_for_a_while_and_then_deleted,
             an_ended_job_is_removed_when_its_owner_asks_for_it,
             a_result_that_somebody_waits_to_read_is_kept,
             a_result_that_is_still_to_be_delivered_is_kept,

@@ -1,4 +1,4 @@
-//! The outbox: what a commit has promised is done by one node at a time, and not forgotten.
+//! The outbox: what a commit has promised is done by one node at a time, and is not lost.
 
 use super::*;
 use crate::job::DeliveryState;

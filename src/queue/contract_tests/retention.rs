@@ -56,12 +56,12 @@ pub(crate) async fn a_result_that_is_still_to_be_delivered_is_kept(stand: &mut i
     assert_eq!(state(&queue, &whole).await, State::Succeeded);
     let done = vec![(taken[0].number, Settled::Done)];
     queue.settle(done).await.expect("settled");
-    let forgotten = async {
+    let deleted = async {
         while queue.known(vec![whole.id]).await != Ok(Vec::new()) {
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     };
-    timeout(PATIENCE, forgotten).await.expect("in time");
+    timeout(PATIENCE, deleted).await.expect("in time");
 }
 
 pub(crate) async fn a_pair_is_not_done_again_while_its_sequence_is_being_closed(

@@ -35,7 +35,7 @@ const FEW_NODES: u32 = 4;
 /// How long rows that are due are handled in one turn.
 const AT_A_TIME: Duration = Duration::from_millis(50);
 
-/// Number of ended jobs that are forgotten in one transaction. Each waits for the disk.
+/// Number of ended jobs that are deleted in one transaction. Each waits for the disk.
 const FORGOTTEN_AT_ONCE: usize = 64;
 
 /// Time after which a claimed job is given back that no worker took.

@@ -137,7 +137,7 @@ fn the_statements_of_the_hot_path_sort_nothing_and_scan_no_table() {
 }
 
 #[tokio::test]
-async fn jobs_that_somebody_waits_for_are_looked_after_before_those_that_are_forgotten() {
+async fn jobs_that_somebody_waits_for_are_looked_after_before_those_that_are_to_be_deleted() {
     const ENDED: usize = 300;
     let mut folder = Folder::new();
     let (queue, _heard) = folder.open(QueueOptions::default()).await;

@@ -183,7 +183,7 @@ pub(in crate::queue) fn keep(
     Ok(())
 }
 
-/// Lets a job be forgotten only after the retention of answered jobs from now on.
+/// Lets a job be deleted only after the retention of answered jobs from now on.
 fn put_off(sql: &dyn Sql, options: &QueueOptions, id: JobId) -> Result<(), QueueError> {
     let later = sql.now().after(options.answered_retention);
     sql.query("UPDATE jobs SET due = ?2 WHERE id = ?1", values![id, later])?;
@@ -232,7 +232,7 @@ pub(in crate::queue) fn left_behind(sql: &dyn Sql, node: i64) -> Result<Vec<JobI
 }
 
 /// Recovers a job that the process of `node` left behind. A running job is requeued, since that
-/// process does not hold it any more. An ephemeral job that it accepted is forgotten, since the
+/// process does not hold it any more. An ephemeral job that it accepted is deleted, since the
 /// caller's connection is gone. After an `orderly` shutdown no crash is counted.
 pub(in crate::queue) fn recover(
     sql: &dyn Sql,

@@ -90,7 +90,7 @@ pub(super) fn followers(sql: &dyn Sql, id: JobId) -> Result<Vec<JobId>, QueueErr
     rows.iter().map(|row| row.get(0)).collect()
 }
 
-/// Makes the followers of a job ready, when it has ended or is about to be forgotten. Their start
+/// Makes the followers of a job ready, when it has ended or is about to be deleted. Their start
 /// tag is its finish tag, but not less than the virtual time, so a chain gets no more than its
 /// share.
 pub(super) fn release_followers(

@@ -34,7 +34,7 @@ pub(super) fn end(
     } else {
         options.answered_retention
     };
-    // A pair is forgotten with its sequence.
+    // A pair is deleted with its sequence.
     let forget = job.parent.is_none().then(|| now.after(kept));
     let text = format!(
         "UPDATE jobs SET state = ?2, finished = ?3, due = ?4, stop_reason = ?5, report = ?6, \

@@ -95,7 +95,8 @@ async fn nodes_that_submit_and_work_at_once_do_every_job_once() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_jobs_of_a_node_that_has_ended_go_to_another_at_once_and_its_callers_are_forgotten() {
+async fn the_jobs_of_a_node_that_has_ended_go_to_another_at_once_and_those_of_its_callers_are_deleted()
+ {
     let Some(database) = Database::new() else {
         return;
     };
@@ -107,7 +108,7 @@ async fn the_jobs_of_a_node_that_has_ended_go_to_another_at_once_and_its_callers
         device: Some(DeviceKind::Gpu),
         ..submission("a")
     };
-    let forgotten = submit(&victim, awaited).await;
+    let deleted = submit(&victim, awaited).await;
     let held = lease(&victim).await;
     assert_eq!((held.job.id, held.job.attempt), (kept, 1));
     drop(victim);
@@ -117,7 +118,7 @@ async fn the_jobs_of_a_node_that_has_ended_go_to_another_at_once_and_its_callers
         (again.job.id, again.job.attempt, again.job.crashes),
         (kept, 2, 1)
     );
-    let is_gone = async || survivor.known(vec![forgotten]).await == Ok(Vec::new());
+    let is_gone = async || survivor.known(vec![deleted]).await == Ok(Vec::new());
     until("it is kept for nobody", is_gone).await;
     let nodes = database
         .server

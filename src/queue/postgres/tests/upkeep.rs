@@ -9,7 +9,7 @@ use crate::queue::outgoing::{Action, Settled};
 use crate::queue::types::{QueueOptions, Submission, Submitted};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_job_that_cannot_be_forgotten_keeps_no_other() {
+async fn a_job_that_cannot_be_deleted_keeps_no_other() {
     const JOBS: usize = 200;
     let Some(database) = Database::new() else {
         return;

@@ -58,7 +58,7 @@ impl Stand {
         self.process.turn(false);
     }
 
-    /// The state of the job; `None` once it is forgotten.
+    /// The state of the job; `None` once it is deleted.
     fn state(&self) -> Option<State> {
         self.process.with(|connection| {
             let mut statement = connection.prepare("SELECT state FROM jobs").expect("SQL");

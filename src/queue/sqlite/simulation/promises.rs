@@ -6,7 +6,7 @@
 //! - Chain: a pair is leased only when the job before it has ended, and the closing job of a sequence when
 //!   all pairs have succeeded.
 //! - Cancelled: after a cancellation a job does not succeed.
-//! - Told: every end of a job with a webhook is told, and the files of every forgotten job are removed.
+//! - Told: every end of a job with a webhook is told, and the files of every deleted job are removed.
 //! - Key: of the jobs of one idempotency key at most one is durable, but for one that gave the key up before.
 //! - Delivered: what a job delivers was delivered, or given up, before its end is told.
 
@@ -73,7 +73,7 @@ pub(super) struct Promises {
     undelivered: HashMap<JobId, Option<JobId>>,
     /// Those of them that ended in the writer's turn: an earlier end may have been told before in it.
     undelivered_now: HashSet<JobId>,
-    forgotten: HashSet<JobId>,
+    deleted: HashSet<JobId>,
     files_removed: HashSet<JobId>,
     /// Whether the machine has lost its power. Commits that had not reached the disk are lost then.
     lost_power: bool,
@@ -96,9 +96,9 @@ impl Promises {
         }
     }
 
-    /// What is known of a job. None once it is forgotten: an answer may come after the event.
+    /// What is known of a job. None once it is deleted: an answer may come after the event.
     fn fact(&mut self, id: JobId) -> Option<&mut Fact> {
-        if self.forgotten.contains(&id) {
+        if self.deleted.contains(&id) {
             return None;
         }
         Some(self.jobs.entry(id).or_default())
@@ -229,11 +229,11 @@ impl Promises {
                 let fact = self.jobs.remove(id);
                 assert!(
                     fact.is_none_or(|fact| fact.end.is_some() || !fact.is_durable),
-                    "{id} is forgotten"
+                    "{id} is deleted"
                 );
                 self.live.remove(id);
                 self.keys.retain(|_, known| known != id);
-                self.forgotten.insert(*id);
+                self.deleted.insert(*id);
             }
         }
     }
@@ -354,7 +354,7 @@ impl Promises {
             }
         }
         self.jobs.retain(|id, _| jobs.contains_key(id));
-        self.forgotten.retain(|id| !jobs.contains_key(id));
+        self.deleted.retain(|id| !jobs.contains_key(id));
         for job in jobs.values() {
             let fact = self.jobs.entry(job.id).or_default();
             fact.end = Some(job.state).filter(|state| state.is_end());
@@ -399,7 +399,7 @@ impl Promises {
         }
     }
 
-    /// All jobs are forgotten and the outbox is empty.
+    /// All jobs are deleted and the outbox is empty.
     pub(super) fn cleared(&self) {
         assert!(
             self.jobs.is_empty(),
@@ -415,7 +415,7 @@ impl Promises {
                 told.len()
             );
         }
-        let kept: Vec<_> = self.forgotten.difference(&self.files_removed).collect();
+        let kept: Vec<_> = self.deleted.difference(&self.files_removed).collect();
         // A power failure loses commits that had not reached the disk. The search for orphaned
         // payloads finds such files.
         assert!(

@@ -347,7 +347,7 @@ impl World {
         self.turn(false);
     }
 
-    /// Workers do all that is left, the outbox is emptied, and everything is forgotten in time.
+    /// Workers do all that is left, the outbox is emptied, and everything is deleted in time.
     fn finish_everything(&mut self) {
         const ROUNDS: usize = 2000;
         self.turn(false);
