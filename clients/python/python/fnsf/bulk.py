@@ -40,8 +40,8 @@ REFUSED = (
     IsADirectoryError,
     NotADirectoryError,
 )
-"""Errors that occur again when the pair is tried again; `DeviceError` is excepted. Other errors are those of a disk or a
-network: the engine tries again."""
+"""Errors that occur again when the pair is tried again; `DeviceError` is excepted. Other errors are those of a disk or
+a network: the engine tries again."""
 # Other schemes, and Azure's other ways to name a server, would send the credentials of this machine there.
 AUTHORITY = {
     "file": re.compile(""),
