@@ -4,8 +4,11 @@
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use fnsf::flow::cpu::CpuBackend;
-use fnsf::flow::simulate::StreetOptions;
-use fnsf::flow::{Control, Estimate, FlowError, Interrupt, Preset, Problem, StopReason, estimate};
+use fnsf::flow::simulate::{Street, StreetOptions};
+use fnsf::flow::{
+    Control, Estimate, FlowError, Interrupt, NeighborSweep, Options, Preset, Problem, StopReason,
+    estimate,
+};
 use fnsf::formats::Pair;
 
 use super::scenes::{shorten_chamfer, street};
@@ -50,12 +53,17 @@ fn run(pair: &Pair, preset: Preset, deadline: Option<f64>) -> Estimate {
     let backend = CpuBackend::new(Some(2)).expect("threads");
     let problem = Problem::pair(&pair.source, &pair.target);
     let clock = Clock::with(deadline);
+    estimate(&backend, &problem, &shortened(preset), &clock).expect("a flow")
+}
+
+/// The options of a preset, with few iterations.
+fn shortened(preset: Preset) -> Options {
     let mut options = preset.options(None);
     shorten_chamfer(&mut options);
     if let Some(field) = options.field_mut() {
         field.max_iterations = field.max_iterations.min(150);
     }
-    estimate(&backend, &problem, &options, &clock).expect("a flow")
+    options
 }
 
 #[test]
@@ -95,6 +103,54 @@ fn a_deadline_that_suffices_changes_no_bit() {
             let iterations = |estimate: &Estimate| estimate.fit().map(|fit| fit.iterations);
             assert_eq!(iterations(&watched), iterations(&free));
         }
+    }
+}
+
+#[test]
+fn a_flow_that_differs_from_the_undisturbed_one_says_that_its_deadline_was_reached() {
+    let street = StreetOptions {
+        beams: 16,
+        azimuth_steps: 125,
+        speed_mps: Some(20.0),
+        rolling: true,
+        sweeps: 4,
+        ..StreetOptions::default()
+    };
+    let street = Street::new(&street).expect("a street");
+    let sweeps = [0, 1, 2, 3].map(|index| street.sweep(index).expect("a sweep"));
+    let neighbor = |index: usize, at| NeighborSweep {
+        points: &sweeps[index].points,
+        ground: None,
+        times: sweeps[index].times.as_deref(),
+        at,
+    };
+    let neighbors = [neighbor(0, -1), neighbor(3, 2)];
+    let times = |index: usize| sweeps[index].times.as_deref().expect("a rolling sweep");
+    let problem = Problem {
+        times: Some([times(1), times(2)]),
+        neighbors: &neighbors,
+        ..Problem::pair(&sweeps[1].points, &sweeps[2].points)
+    };
+    let backend = CpuBackend::new(Some(2)).expect("threads");
+    for preset in Preset::ALL {
+        let options = shortened(preset);
+        let run = |deadline: Option<f64>| {
+            let clock = Clock::with(deadline);
+            estimate(&backend, &problem, &options, &clock).expect("a flow")
+        };
+        let free = run(None);
+        let mut ends = [0, 0];
+        for step in 0..24 {
+            let deadline = 1e-5 * 1.8_f64.powi(step);
+            let estimate = run(Some(deadline));
+            let is_cut = estimate.stop_reason == StopReason::Deadline;
+            ends[usize::from(is_cut)] += 1;
+            assert!(
+                is_cut || estimate.flow == free.flow,
+                "{preset:?} {deadline}"
+            );
+        }
+        assert!(ends.iter().all(|&count| count > 3), "{preset:?}: {ends:?}");
     }
 }
 

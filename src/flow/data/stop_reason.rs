@@ -3,15 +3,15 @@
 /// The reason why a method ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum StopReason {
-    /// The object search covered all clusters. A deadline may still have dropped neighbor sweeps or
-    /// points of the registration.
+    /// The object search covered all clusters.
     Completed,
     /// The early-stopping rule ended the fit.
     Converged,
     /// The fit did its maximum number of iterations.
     MaxIterations,
-    /// The deadline ended, shortened or prevented the method. The flow is the best that the time
-    /// allowed.
+    /// The deadline ended, shortened or prevented a part of the method: points of the registration,
+    /// deskewing, neighbor sweeps, clusters, iterations or rows. The flow is the best that the time allowed.
+    /// With every other reason, the flow of a pair by itself is the one without a deadline.
     Deadline,
 }
 

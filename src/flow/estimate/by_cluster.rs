@@ -63,7 +63,10 @@ pub(super) fn residual_motion(
             query_seconds: 0.0,
         },
         fitted: 0,
-        stop_reason: StopReason::Converged,
+        stop_reason: match (whole, control.interrupt()) {
+            (true, None) => StopReason::Converged,
+            _ => StopReason::Deadline,
+        },
     };
     let mut left: usize = clusters.iter().map(Vec::len).sum();
     for (number, rows) in clusters.iter().enumerate() {

@@ -5,7 +5,7 @@ use std::cell::LazyCell;
 use super::ego_motion::{ego_motion, has_time_for_all, prior};
 use super::method::{Input, Solved};
 use super::result::{FieldSolution, Solution};
-use crate::flow::data::{Hash, Point};
+use crate::flow::data::{Hash, Point, StopReason};
 use crate::flow::error::FlowError;
 use crate::flow::field::{self, Backend, Fit, Fitted, FittedField, Prior, Snapshot};
 use crate::flow::motion::{MotionField, Residual};
@@ -42,9 +42,10 @@ pub(super) fn residual_motion(
     let prior = prior(problem, input.options);
     let registered = |whole| ego_motion(host, selection, input.options.ego, &prior, whole, control);
     // A cycle leads back to the source as it is aligned.
+    let early_whole = !options.has_cycle() || has_time_for_all(selection, control);
     let early = options
         .has_cycle()
-        .then(|| input.align(host, registered(has_time_for_all(selection, control))));
+        .then(|| input.align(host, registered(early_whole)));
     let early = early.transpose()?;
     let source = early
         .as_ref()
@@ -101,7 +102,10 @@ pub(super) fn residual_motion(
             query_seconds: fitted.report.query_seconds,
             distance_bytes: prepared.map_or(0, |prepared| prepared.target.bytes()),
         }),
-        stop_reason: fitted.stop_reason,
+        stop_reason: match early_whole {
+            true => fitted.stop_reason,
+            false => StopReason::Deadline,
+        },
         device: backend.name(),
         precomputed_at: fitted.precomputed_at,
     })

@@ -37,8 +37,8 @@ pub(super) fn residual_motion(
     let ego = alignment.ego;
     let motion = ego.unwrap_or_default();
     let aligned = &alignment.aligned;
-    let neighbors = match &ego {
-        None => Vec::new(),
+    let (neighbors, has_all) = match &ego {
+        None => (Vec::new(), true),
         Some(ego) => aligned_neighbors(host, input, ego)?,
     };
     let precomputed_at = control.seconds();
@@ -108,8 +108,8 @@ pub(super) fn residual_motion(
         }),
         own_rows,
         stop_reason: match search.interrupted {
-            Some(_) => StopReason::Deadline,
-            None => StopReason::Completed,
+            None if whole && has_all => StopReason::Completed,
+            _ => StopReason::Deadline,
         },
         device: if search.on_device {
             backend.name()

@@ -47,9 +47,14 @@ pub(super) struct DeskewedPair {
     pub(super) ego: Registration,
 }
 
+/// Whether a pair is to be deskewed where it moves: its points have times.
+pub(super) fn has_deskew(problem: &Problem, options: &Options) -> bool {
+    problem.times.is_some() && options.ego != Ego::Off
+}
+
 /// Deskews the pair of `problem` and its neighbor sweeps, and decides by the fit of near points
 /// whether the result is used. A pair of a standing vehicle is used as it was given. None where
-/// times are missing, without an ego motion, and where too little time is left.
+/// [`has_deskew`] is false, and where too little time is left.
 ///
 /// # Errors
 /// [`FlowError::TimesLength`].
@@ -66,7 +71,7 @@ pub(super) fn deskew(
         control.interrupt().is_some() || control.seconds_left().is_some_and(|left| left < needed);
     let Some(times) = problem
         .times
-        .filter(|_| options.ego != Ego::Off && !is_late)
+        .filter(|_| has_deskew(problem, options) && !is_late)
     else {
         return Ok(None);
     };

@@ -15,7 +15,8 @@ use crate::flow::select::{cropped, select_neighbor};
 const SECONDS_PER_POINT: f64 = 2e-5;
 
 /// The neighbor sweeps of the problem that the options use and the remaining time allows, in the
-/// target's frame. `ego` is the ego motion of the pair, target_from_source.
+/// target's frame, and whether time was left for all of them. `ego` is the ego motion of the pair,
+/// target_from_source.
 ///
 /// A neighbor sweep that shows another scene than the target is left out: the sequence has a cut
 /// there. Its overlap is measured as that of a pair, see [`overlap()`]. Where the ground is among the
@@ -27,7 +28,7 @@ pub(super) fn aligned_neighbors(
     host: &Host,
     input: &Input<'_>,
     ego: &RigidTransform,
-) -> Result<Vec<AlignedSweep>, FlowError> {
+) -> Result<(Vec<AlignedSweep>, bool), FlowError> {
     let Input {
         problem,
         selection,
@@ -38,14 +39,14 @@ pub(super) fn aligned_neighbors(
     let find_ground = |sweeps: &[&[Point]]| host.ground(sweeps);
     let order = problem.nearest_neighbors(options.sweeps());
     if order.is_empty() {
-        return Ok(Vec::new());
+        return Ok((Vec::new(), true));
     }
     let target = cropped(problem.target, options);
     let mut aligned = Vec::with_capacity(order.len());
     for sweep in order {
         let whole = cropped(sweep.points, options);
         if !has_time(whole.len() + target.len(), control) {
-            break;
+            return Ok((aligned, false));
         }
         let points = select_neighbor(sweep, options, &find_ground)?;
         // E^(1 - at): the target itself is at 1.
@@ -67,7 +68,7 @@ pub(super) fn aligned_neighbors(
             at: sweep.at,
         });
     }
-    Ok(aligned)
+    Ok((aligned, true))
 }
 
 /// Whether the remaining time allows a neighbor sweep: a registration of `points` points in total,

@@ -7,10 +7,10 @@ use bytemuck::cast_slice;
 use super::by_cluster;
 use super::by_field;
 use super::by_objects;
-use super::deskewing::deskew;
+use super::deskewing::{deskew, has_deskew};
 use super::method::{Alignment, Input, Solved};
 use super::result::{Estimate, Solution};
-use crate::flow::data::{Control, DYNAMIC_M, Point, transform_point};
+use crate::flow::data::{Control, DYNAMIC_M, Point, StopReason, transform_point};
 use crate::flow::error::FlowError;
 use crate::flow::field::{Backend, Snapshot, SnapshotError};
 use crate::flow::motion::MotionField;
@@ -70,6 +70,7 @@ fn estimate_from(
 ) -> Result<Estimate, FlowError> {
     let began = control.seconds();
     let deskewed = deskew(backend.host(), problem, options, control)?;
+    let lacks_deskew = deskewed.is_none() && has_deskew(problem, options);
     let given = [problem.source, problem.target];
     let (mut problem, mut options) = (*problem, Cow::Borrowed(options));
     let mut is_deskewed = false;
@@ -108,6 +109,9 @@ fn estimate_from(
         },
     };
     let mut estimate = assemble(&input, solved, [began, selected_at]);
+    if lacks_deskew {
+        estimate.stop_reason = StopReason::Deadline;
+    }
     if let Some(pair) = deskewed {
         estimate.ego_covariance = pair.ego.covariance;
         estimate.deskew = pair.deskew;

@@ -1,7 +1,7 @@
 //! Tests of the estimate: masks, ground, deadlines, cancellation and a given ego motion.
 
 use std::sync::Mutex;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use super::ego_motion::prior;
 use super::*;
@@ -146,6 +146,30 @@ fn a_deadline_before_the_first_iteration_still_gives_a_flow() {
     let estimate = estimated(&street(), &Preset::Neural.options(None), &now).expect("a flow");
     assert_eq!(estimate.fit().expect("a fit").iterations, 0);
     assert!(estimate.flow.iter().flatten().all(|f| f.is_finite()));
+}
+
+#[test]
+fn an_evaluation_that_comes_too_late_is_told() {
+    /// Late after the last iteration.
+    struct LateAtTheEnd(AtomicBool);
+    impl Control for LateAtTheEnd {
+        fn seconds_left(&self) -> Option<f64> {
+            let is_late = self.0.load(Ordering::Relaxed);
+            Some(if is_late { 0.0 } else { 1e6 })
+        }
+        fn progress(&self, progress: Progress) {
+            self.0
+                .store(progress.done == progress.total, Ordering::Relaxed);
+        }
+    }
+    let mut options = Preset::Neural.options(None);
+    options.field_mut().expect("a field").max_iterations = 5;
+    let free = estimated(&street(), &options, &Uncontrolled).expect("a flow");
+    assert_eq!(free.stop_reason, StopReason::MaxIterations);
+    let late = LateAtTheEnd(AtomicBool::new(false));
+    let late = estimated(&street(), &options, &late).expect("a flow");
+    assert!(late.flow != free.flow);
+    assert_eq!(late.stop_reason, StopReason::Deadline);
 }
 
 /// A device that has no memory for cells below a size, metres. Counts the refusals, and keeps the source

@@ -305,14 +305,15 @@ impl<'a> Loop<'a> {
     }
 }
 
-/// The flow of the result so far at `points`, metres; zero for the points after the deadline.
+/// The flow of the result so far at `points`, metres, and whether the time sufficed for all of them. It is
+/// zero for the points after the deadline.
 pub(crate) fn evaluate(
     trainer: &mut dyn Trainer,
     points: &[Point],
     control: &dyn Control,
-) -> Result<Vec<Point>, FitError> {
+) -> Result<(Vec<Point>, bool), FitError> {
     if control.seconds_left().is_none() {
-        return Ok(trainer.evaluate(points)?);
+        return Ok((trainer.evaluate(points)?, true));
     }
     let mut flow = Vec::with_capacity(points.len());
     for rows in points.chunks(ROWS_AT_ONCE) {
@@ -321,6 +322,7 @@ pub(crate) fn evaluate(
         }
         flow.extend(trainer.evaluate(rows)?);
     }
+    let is_whole = flow.len() == points.len();
     flow.resize(points.len(), [0.0; 3]);
-    Ok(flow)
+    Ok((flow, is_whole))
 }

@@ -92,14 +92,17 @@ impl Fit<'_> {
             options,
             ..
         } = started;
-        let residual = evaluate(trainer.as_mut(), self.aligned, self.control)?;
+        let (residual, is_whole) = evaluate(trainer.as_mut(), self.aligned, self.control)?;
         let field = trainer.fitted()?;
         Ok(Fitted {
             residual,
             max_iterations: options.max_iterations,
             field: Some(field),
             report: trainer.report(),
-            stop_reason,
+            stop_reason: match is_whole {
+                true => stop_reason,
+                false => StopReason::Deadline,
+            },
             precomputed_at,
         })
     }
