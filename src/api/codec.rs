@@ -246,17 +246,20 @@ pub(super) fn read_pair(
     ])
 }
 
-/// Refuses raw coordinates that are not finite or too large, as the file decoders do.
+/// Refuses raw coordinates that are not finite or too large, as the file decoders do. Rows of three NaN are
+/// beams without return.
 ///
 /// # Errors
 /// [`ApiError::BadInput`], with the row and the value.
 pub(super) fn check_points(part: &str, points: &[crate::flow::Point]) -> Result<(), ApiError> {
     let usable = |value: &f32| value.is_finite() && f64::from(value.abs()) <= MAX_COORDINATE_M;
-    let broken = points.iter().position(|point| !point.iter().all(usable));
-    match broken {
+    let is_valid = |point: &crate::flow::Point| {
+        point.iter().all(usable) || point.iter().all(|value| value.is_nan())
+    };
+    match points.iter().position(|point| !is_valid(point)) {
         None => Ok(()),
         Some(row) => Err(ApiError::BadInput(format!(
-            "{part}: row {row} is {:?}, not three finite coordinates within {MAX_COORDINATE_M} m",
+            "{part}: row {row} is {:?}, neither three finite coordinates within {MAX_COORDINATE_M} m nor three NaN",
             points[row]
         ))),
     }

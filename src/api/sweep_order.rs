@@ -1,36 +1,27 @@
 //! The order of the sweeps of a sequence, by the numbers in their names.
 
 use super::error::ApiError;
-use crate::formats::turning_sweep;
+use crate::formats;
 
-/// The names of the latest sweeps of a sequence.
+/// The order of the sweeps so far.
 #[derive(Debug, Default)]
-pub(super) struct SweepOrder {
-    latest: Vec<String>,
-}
+pub(super) struct SweepOrder(formats::SweepOrder);
 
 impl SweepOrder {
-    /// Adds the name of the next sweep.
+    /// Adds the name of the next sweep. One without a name counts for nothing.
     ///
     /// # Errors
     /// [`ApiError::BadInput`] if the numbers of the names turn back, as of files in the order 1, 10,
     /// 2. Not with `force`.
     pub(super) fn push(&mut self, name: &str, force: bool) -> Result<(), ApiError> {
-        self.latest.push(name.to_owned());
-        let names: Vec<&str> = self.latest.iter().map(String::as_str).collect();
-        if let Some(at) = turning_sweep(&names)
-            && !force
-        {
-            return Err(ApiError::BadInput(format!(
-                "{:?} is followed by {:?}, against the order of the sweeps before: send sweeps in the \
-                 order in which they were recorded, or set force",
-                names[at],
-                names[at + 1]
-            )));
+        let turned = (!name.is_empty()).then(|| self.0.push(name)).flatten();
+        match turned {
+            Some(before) if !force => Err(ApiError::BadInput(format!(
+                "{before:?} is followed by {name:?}, against the order of the sweeps before: send sweeps in the \
+                 order in which they were recorded, or set force"
+            ))),
+            _ => Ok(()),
         }
-        // A turn shows in three names.
-        self.latest.drain(..self.latest.len().saturating_sub(2));
-        Ok(())
     }
 }
 
@@ -58,5 +49,6 @@ mod tests {
         );
         assert_eq!(pushed(&names, true), Ok(()));
         assert_eq!(pushed(&["", "", ""], false), Ok(()));
+        assert!(pushed(&["1.pcd", "10.pcd", "", "2.pcd"], false).is_err());
     }
 }

@@ -112,12 +112,16 @@ impl Densify {
         let options = self.estimation.options()?;
         check_sequence(&options, self.sweeps.len())?;
         let terminal = Terminal::new();
-        let surroundings = self.estimation.surroundings(&self.sweeps)?;
+        let mut surroundings = self.estimation.surroundings(&self.sweeps)?;
         let mut device = self.estimation.open()?;
         let solver_options = options.solver_options(usize::MAX);
         let mut intensities = self.output.is_some().then(Vec::new);
+        let mut points = Vec::new();
         let read = |(index, path): (usize, &PathBuf)| {
-            let sweep = surroundings.sweep(index, path)?;
+            let mut sweep = surroundings.sweep(index, path)?;
+            // A dense cloud has the points of the files.
+            sweep.times = None;
+            points.push(sweep.points.len());
             let sweep = sweep.prepared(&solver_options);
             if let Some(mut known) = intensities.take() {
                 let rows = sweep.rows_in_crop(&solver_options);
@@ -134,7 +138,7 @@ impl Densify {
         let began = terminal.seconds();
         let fields = fit(
             &plan,
-            &sweeps,
+            (&sweeps, &points),
             &mut device,
             &surroundings,
             &options,
@@ -315,10 +319,11 @@ fn by_row(by_sweep: Vec<Vec<f32>>, cloud: &DenseCloud) -> Vec<f32> {
         .collect()
 }
 
-/// The motion fields of all edges of the plan.
+/// The motion fields of all edges of the plan. `points` are the numbers of points of the sweeps before they
+/// were cropped.
 fn fit(
     plan: &Plan,
-    sweeps: &[Sweep],
+    (sweeps, points): (&[Sweep], &[usize]),
     device: &mut Device<'_>,
     surroundings: &Surroundings,
     options: &JobOptions,
@@ -332,7 +337,7 @@ fn fit(
             done,
         } => {
             terminal.part(&format!("pair {} of {pairs}", done + 1));
-            let larger = sweeps[before].points.len().max(sweeps[index].points.len());
+            let larger = points[before].max(points[index]);
             let solver_options = surroundings.options(options, larger, [before, index]);
             device.push(sequence, &sweeps[index], &solver_options, terminal)
         }

@@ -11,10 +11,10 @@ use super::failure::Failure;
 use super::output::complain;
 use super::{device, files};
 use crate::flow::field::{Backend, BackendError};
-use crate::flow::{
-    self, Control, Ego, Estimate, FlowError, Point, RigidTransform, Sequence, Sweep,
+use crate::flow::{self, Control, Estimate, FlowError, Point, RigidTransform, Sequence, Sweep};
+use crate::formats::{
+    self, PointTimes, SweepClock, SweepOrder, TimedCloud, pair_interval_s, sweep_time_s,
 };
-use crate::formats::{self, PointTimes, SweepClock, TimedCloud, pair_interval_s, sweep_time_s};
 use crate::job::{
     DeviceChoice, EgoChoice, FieldChoices, GroundChoice, JobOptions, PrecisionChoice, PresetChoice,
 };
@@ -162,18 +162,15 @@ impl Estimation {
             Some(file) => Some(files::read_poses(file, paths)?),
         };
         let raster = self.ground_raster.as_deref().map(files::read_ground_raster);
-        let name = |path: &PathBuf| path.to_string_lossy().into_owned();
-        let names: Vec<String> = paths.iter().map(name).collect();
-        warn_of_disorder(&names);
-        let known = names
-            .into_iter()
-            .map(|name| KnownSweep { name, clock: None });
-        Ok(Surroundings {
-            known: known.collect(),
+        let mut surroundings = Surroundings {
+            known: VecDeque::new(),
             forgotten: 0,
+            order: Some(SweepOrder::default()),
             poses,
             raster: raster.transpose()?,
-        })
+        };
+        paths.iter().for_each(|path| surroundings.add(path));
+        Ok(surroundings)
     }
 
     /// Opens the device. For options without kernels for a GPU, `auto` opens the CPU backend.
@@ -194,18 +191,6 @@ impl Estimation {
             asked: self,
             backend,
         })
-    }
-}
-
-/// Warns on stderr where the numbers in the names of the sweeps turn back.
-fn warn_of_disorder(names: &[String]) {
-    let names: Vec<&str> = names.iter().map(AsRef::as_ref).collect();
-    if let Some(at) = formats::turning_sweep(&names) {
-        let (sweep, next) = (names[at], names[at + 1]);
-        complain(format_args!(
-            "warning: {sweep} is followed by {next}, against the order of the others: sweeps are \
-             taken as they are given, so give them in the order in which they were recorded"
-        ));
     }
 }
 
@@ -269,6 +254,8 @@ pub(super) struct Surroundings {
     known: VecDeque<KnownSweep>,
     /// Number of sweeps before them.
     forgotten: usize,
+    /// The order of their names. None once it was told that it turns back.
+    order: Option<SweepOrder>,
     poses: Option<Vec<RigidTransform>>,
     raster: Option<formats::GroundRaster>,
 }
@@ -282,12 +269,17 @@ struct KnownSweep {
 }
 
 impl Surroundings {
-    /// Adds a sweep to the end of the sequence.
+    /// Adds a sweep to the end of the sequence. Warns where the numbers in the names turn back.
     pub(super) fn add(&mut self, path: &Path) {
-        self.known.push_back(KnownSweep {
-            name: path.to_string_lossy().into_owned(),
-            clock: None,
-        });
+        let name = path.to_string_lossy().into_owned();
+        if let Some(before) = self.order.as_mut().and_then(|order| order.push(&name)) {
+            complain(format_args!(
+                "warning: {before} is followed by {name}, against the order of the others: sweeps are \
+                 taken as they are given, so give them in the order in which they were recorded"
+            ));
+            self.order = None;
+        }
+        self.known.push_back(KnownSweep { name, clock: None });
     }
 
     /// The index of the next sweep that is added.
@@ -329,28 +321,15 @@ impl Surroundings {
         let pair = [source, target];
         let mut options = self.timed(options, pair).solver_options(points);
         options.newest_first = self.interval_s(pair).is_some_and(f32::is_sign_negative);
-        if let Some(poses) = &self.poses {
-            options.ego = Ego::Given(poses[target].inv_mul(&poses[source]));
-        } else if source > target {
-            options.ego = options.ego.reversed();
-        }
+        let poses = self.poses.as_ref();
+        let poses = poses.map(|poses| pair.map(|sweep| poses[sweep]));
+        options.ego = options.ego.of_pair(poses, source > target);
         options
     }
 
-    /// Reads the sweep with index `index`. Where a ground raster is given, the sweep gets a ground
-    /// mask.
-    pub(super) fn sweep(&self, index: usize, path: &Path) -> Result<Sweep, Failure> {
-        let points = files::read_cloud(path)?;
-        Ok(Sweep {
-            ground: self.ground(index, &points),
-            points,
-            times: None,
-            time_s: sweep_time_s(&path.to_string_lossy(), None),
-        })
-    }
-
-    /// As [`Self::sweep`], with the times of the points.
-    pub(super) fn timed_sweep(&mut self, index: usize, path: &Path) -> Result<Sweep, Failure> {
+    /// Reads the sweep with index `index`, with the times of its points. Where a ground raster is given,
+    /// the sweep gets a ground mask.
+    pub(super) fn sweep(&mut self, index: usize, path: &Path) -> Result<Sweep, Failure> {
         let TimedCloud {
             cloud,
             times,

@@ -11,7 +11,7 @@ use indicatif::ProgressBar;
 
 use super::failure::Failure;
 use super::files;
-use super::output::{complain, say};
+use super::output::say;
 use super::terminal::bar;
 use crate::flow::RigidTransform;
 use crate::formats::{
@@ -160,11 +160,7 @@ impl Export {
             return Ok(());
         };
         if files::read_timed_cloud(first)?.times.is_some() {
-            complain(format_args!(
-                "warning: the points of these sweeps have times. If the tracks are those of deskewed sweeps, their boxes \
-                 lie beside the points at high speed: fnsf label --ignore-times and fnsf flow --deskew off make tracks \
-                 that fit"
-            ));
+            files::warn_of_times("tracks");
         }
         Ok(())
     }

@@ -11,6 +11,7 @@ use rustix::fs::{Access, access};
 
 use super::failure::Failure;
 use super::laz;
+use super::output::complain;
 use super::unfinished::Unfinished;
 use crate::flow::depth::Camera;
 use crate::flow::tracks::Track;
@@ -96,6 +97,14 @@ pub(super) fn read_poses(file: &Path, paths: &[PathBuf]) -> Result<Vec<RigidTran
 /// Reads one sweep with the times of its points, in any format.
 pub(super) fn read_timed_cloud(path: &Path) -> Result<TimedCloud, Failure> {
     read(path, formats::read_timed_cloud)
+}
+
+/// Warns that the points of sweeps have times, where `what`, such as tracks, may be those of deskewed sweeps.
+pub(super) fn warn_of_times(what: &str) {
+    complain(format_args!(
+        "warning: the points of these sweeps have times. If the {what} are those of deskewed sweeps, they lie beside \
+         the points at high speed: fnsf label --ignore-times and fnsf flow --deskew off make {what} that fit"
+    ));
 }
 
 /// Reads a pair of sweeps from one `.npz`.

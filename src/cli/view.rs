@@ -10,13 +10,13 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
-use super::estimation::{Estimation, check_sequence};
+use super::estimation::{Estimation, Surroundings, check_sequence};
 use super::failure::Failure;
 use super::files;
 use super::output::say;
 use super::terminal::Terminal;
 use crate::api::{ListenOptions, Listener, LocalPair, LocalScene, view_router};
-use crate::flow::tracks::{ClusteredSweep, Tracker};
+use crate::flow::tracks::{Tracker, push_and_correct};
 use crate::flow::{Estimate, Objects, Point, Sequence, Sweep};
 use crate::formats::{
     FlowFile, FlowFormat, FlowTable, is_dense, is_pair, matrix_rows, write_flow, write_tracks,
@@ -96,12 +96,13 @@ impl View {
                 });
             }
         }
-        let (sweeps, mut scene) = self.sweeps()?;
+        let mut surroundings = self.estimation.surroundings(&self.files)?;
+        let (sweeps, mut scene) = self.sweeps(&mut surroundings)?;
         scene.name = name;
         if !self.flow.is_empty() {
-            scene.pairs = self.given_flows(&sweeps)?;
+            scene.pairs = self.given_flows(&sweeps, &surroundings)?;
         } else if !self.no_flow && sweeps.len() > 1 {
-            self.estimate(&sweeps, &mut scene)?;
+            self.estimate(&sweeps, &surroundings, &mut scene)?;
         }
         if let Some(path) = &self.tracks {
             files::read_tracks(path)?;
@@ -110,7 +111,7 @@ impl View {
         Ok(scene)
     }
 
-    fn sweeps(&self) -> Result<(Vec<Sweep>, LocalScene), Failure> {
+    fn sweeps(&self, surroundings: &mut Surroundings) -> Result<(Vec<Sweep>, LocalScene), Failure> {
         let mut sweeps = Vec::new();
         let mut names = Vec::new();
         let sweep = |points: Vec<Point>, ground: Option<Vec<bool>>| Sweep {
@@ -128,10 +129,16 @@ impl View {
             sweeps.extend([sweep(pair.source, source), sweep(pair.target, target)]);
             names.extend(["source".to_owned(), "target".to_owned()]);
         } else {
-            let surroundings = self.estimation.surroundings(&self.files)?;
+            let mut have_times = false;
             for (index, path) in self.files.iter().enumerate() {
-                sweeps.push(surroundings.sweep(index, path)?);
+                let mut sweep = surroundings.sweep(index, path)?;
+                // The points of the files are shown.
+                have_times |= sweep.times.take().is_some();
+                sweeps.push(sweep);
                 names.push(file_name(path));
+            }
+            if have_times && !(self.flow.is_empty() && self.tracks.is_none()) {
+                files::warn_of_times("flows and tracks");
             }
         }
         let packed = sweeps
@@ -144,7 +151,11 @@ impl View {
         Ok((sweeps, scene))
     }
 
-    fn given_flows(&self, sweeps: &[Sweep]) -> Result<Vec<LocalPair>, Failure> {
+    fn given_flows(
+        &self,
+        sweeps: &[Sweep],
+        surroundings: &Surroundings,
+    ) -> Result<Vec<LocalPair>, Failure> {
         if self.flow.len() + 1 != sweeps.len() {
             return Err(Failure::usage(anyhow!(
                 "{} sweeps have {} pairs, but --flow names {} files",
@@ -154,7 +165,6 @@ impl View {
             )));
         }
         let options = self.estimation.options()?;
-        let surroundings = self.estimation.surroundings(&self.files)?;
         let mut pairs = Vec::new();
         for (source, path) in self.flow.iter().enumerate() {
             let file = files::read_flow(path)?;
@@ -177,13 +187,17 @@ impl View {
     }
 
     /// Estimates the flow of each pair and, for a sequence, the tracks.
-    fn estimate(&self, sweeps: &[Sweep], scene: &mut LocalScene) -> Result<(), Failure> {
+    fn estimate(
+        &self,
+        sweeps: &[Sweep],
+        surroundings: &Surroundings,
+        scene: &mut LocalScene,
+    ) -> Result<(), Failure> {
         let terminal = Terminal::new();
         let options = self.estimation.options()?;
         if self.files.len() > 1 {
             check_sequence(&options, sweeps.len())?;
         }
-        let surroundings = self.estimation.surroundings(&self.files)?;
         let mut device = self.estimation.open()?;
         let mut sequence = Sequence::default();
         let mut estimates: Vec<Estimate> = Vec::new();
@@ -203,14 +217,14 @@ impl View {
         }
         terminal.finish();
         let mut tracker = (sweeps.len() >= FEWEST_SWEEPS).then(Tracker::default);
-        for (source, estimate) in estimates.into_iter().enumerate() {
+        for (source, mut estimate) in estimates.into_iter().enumerate() {
             let timed = surroundings.timed(&options, [source, source + 1]);
             let points = &sweeps[source].points;
             let dt_s = timed.solver_options(0).dt_s;
             tracker = tracker.filter(|_| estimate.objects().is_some() && estimate.ego.is_some());
             if let Some(tracker) = &mut tracker {
-                let sweep = ClusteredSweep::new(points, &estimate, dt_s);
-                let tracked = sweep.and_then(|sweep| tracker.push(&sweep));
+                let pair = [source, source + 1].map(|index| sweeps[index].points.as_slice());
+                let tracked = push_and_correct(tracker, pair, &mut estimate, dt_s);
                 tracked.map_err(Failure::internal)?;
             }
             let flow = npz(&FlowTable::new(points, &estimate))?;

@@ -36,7 +36,8 @@ pub struct TimedCloud {
     pub cloud: Cloud,
     /// The time of each point. None if the file has none, or the same for all points.
     pub times: Option<PointTimes>,
-    /// Why the file's column of times is not used, if it is not that of one sweep.
+    /// Why the file's column of times is not used: a time is NaN or infinite, or they are not those of one
+    /// sweep.
     pub refused_times: Option<String>,
 }
 
@@ -99,7 +100,7 @@ pub fn read_cloud_within(
 /// milliseconds, microseconds or nanoseconds: in one of them the times span a sweep of 0.01 to 1 s.
 ///
 /// # Errors
-/// As for [`read_cloud`], and `NotFinite` for a time that is NaN or infinite.
+/// As for [`read_cloud`].
 pub fn read_timed_cloud(bytes: &[u8], name: Option<&str>) -> Result<TimedCloud, FormatError> {
     let (cloud, column) = read(bytes, name, MAX_POINTS, true)?;
     let (times, refused_times) = TimesColumn::used(column);
@@ -245,7 +246,7 @@ fn read_ply(
         }
         points.push(point(kind, row, values)?);
         if let (Some(times), Some(&time)) = (&mut times, values.get(AXES.len())) {
-            times.push(kind, row, time)?;
+            times.push(time);
         }
         Ok(())
     })?;
@@ -287,7 +288,7 @@ fn read_pcd(
         }
         if let (Some(times), Some(&time)) = (&mut times, values.get(AXES.len())) {
             match returned {
-                true => times.push(kind, row, time)?,
+                true => times.push(time),
                 false => times.push_no_return(),
             }
         }
@@ -307,7 +308,10 @@ fn read_feather(
     let points = read_columns(&table, AXES)?;
     let mut times = TimesColumn::find(|name| timed && table.has(name));
     if let Some(times) = &mut times {
-        table.each(times.name(), |row, time| times.push(kind, row, time))?;
+        table.each(times.name(), |_, time| {
+            times.push(time);
+            Ok(())
+        })?;
     }
     Ok((Cloud::from(points), times))
 }
@@ -324,10 +328,10 @@ fn read_las(
     let mut times = TimesColumn::find(|name| timed && las.has_times() && name == "timestamp");
     las.each(|row, [x, y, z, time]| {
         points.push(point(kind, row, &[x, y, z])?);
-        match &mut times {
-            Some(times) => times.push(kind, row, time),
-            None => Ok(()),
+        if let Some(times) = &mut times {
+            times.push(time);
         }
+        Ok(())
     })?;
     Ok((Cloud::from(points), times))
 }

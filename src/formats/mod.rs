@@ -66,6 +66,6 @@ pub use crate::formats::poses::{PoseFile, read_poses};
 pub use crate::formats::scene::{Scene, SceneSweep};
 pub use crate::formats::semantic_kitti::moving_labels;
 pub use crate::formats::sniff::recognize;
-pub use sweep_order::{compare_names, turning_sweep};
+pub use sweep_order::{SweepOrder, compare_names, turning_sweep};
 pub use timestamps::{SweepClock, SweepTime, TimeUnit, pair_interval_s, sweep_time_s};
 pub use tracks::{is_tracks, read_tracks, write_tracks};

@@ -1,7 +1,5 @@
 //! Times of the points of one sweep, in the units and from the origins that drivers write.
 
-use super::error::{FileKind, FormatError};
-use super::limits::check_finite;
 use super::timestamps::SweepClock;
 
 /// Names of a column of point times, the first that is there is read. `offset_ns` is Argoverse 2's,
@@ -46,6 +44,8 @@ impl PointTimes {
 pub(super) struct TimesColumn {
     name: &'static str,
     values: Vec<f64>,
+    /// The first row with a return whose time is NaN or infinite.
+    not_finite: Option<usize>,
 }
 
 impl TimesColumn {
@@ -57,8 +57,11 @@ impl TimesColumn {
 
     /// A column of another name, which the format determines.
     pub(super) fn named(name: &'static str) -> Self {
-        let values = Vec::new();
-        Self { name, values }
+        Self {
+            name,
+            values: Vec::new(),
+            not_finite: None,
+        }
     }
 
     /// The name of the column.
@@ -67,17 +70,11 @@ impl TimesColumn {
     }
 
     /// Adds the time of the next row.
-    ///
-    /// # Errors
-    /// [`FormatError::NotFinite`].
-    pub(super) fn push(
-        &mut self,
-        kind: FileKind,
-        row: usize,
-        time: f64,
-    ) -> Result<(), FormatError> {
-        self.values.push(check_finite(kind, row, self.name, time)?);
-        Ok(())
+    pub(super) fn push(&mut self, time: f64) {
+        if !time.is_finite() {
+            self.not_finite.get_or_insert(self.values.len());
+        }
+        self.values.push(time);
     }
 
     /// Adds a row without return.
@@ -99,6 +96,12 @@ impl TimesColumn {
     /// The duration determines the unit. The time of the sweep is the origin of the column if that is
     /// at most two durations away from the points, otherwise the first point's.
     fn times(&self) -> Result<Option<PointTimes>, String> {
+        if let Some(row) = self.not_finite {
+            return Err(format!(
+                "its column {} is NaN or infinite in row {row}: the points count as measured at one instant",
+                self.name
+            ));
+        }
         let finite = || {
             self.values
                 .iter()
@@ -190,6 +193,12 @@ mod tests {
         assert_eq!(times("time", &[f64::NAN, f64::NAN]), Ok(None));
         let refused = times("time", &[0.0, 86_400.0 * 1e12]).expect_err("a day of picoseconds");
         assert!(refused.contains("column time spans 8.640e16"), "{refused}");
+        let mut column = TimesColumn::named("time");
+        for time in [0.0, f64::NAN, 0.1] {
+            column.push(time);
+        }
+        let refused = column.times().expect_err("no time");
+        assert!(refused.contains("infinite in row 1"), "{refused}");
     }
 
     #[test]

@@ -32,8 +32,42 @@ pub fn compare_names(one: &str, other: &str) -> Ordering {
         .then_with(|| one.cmp(other))
 }
 
-/// The index of the first sweep after which the numbers of the file names go the other way. None if
-/// they rise or fall throughout, or if the names differ in more than their numbers.
+/// Whether two names differ in their numbers alone.
+fn is_comparable(one: &str, other: &str) -> bool {
+    let [one, other] = [one, other].map(parts);
+    one.0 == other.0 && one.1.len() == other.1.len()
+}
+
+/// The order of the sweeps of a sequence by the numbers of their file names, name by name. It begins anew
+/// where two names differ in more than their numbers.
+#[derive(Clone, Debug, Default)]
+pub struct SweepOrder {
+    last: Option<String>,
+    /// How the numbers go on, once two names have shown it.
+    direction: Option<Ordering>,
+}
+
+impl SweepOrder {
+    /// Adds the name of the next sweep. Returns the name before it where the numbers turn back there.
+    pub fn push(&mut self, name: &str) -> Option<String> {
+        let last = self.last.replace(name.to_owned())?;
+        if !is_comparable(&last, name) {
+            self.direction = None;
+            return None;
+        }
+        let [(_, before), (_, after)] = [&last, name].map(|name| parts(name));
+        let steps = before.iter().zip(&after).map(|(a, b)| compared(a, b));
+        let step = steps.fold(Ordering::Equal, Ordering::then);
+        if step == Ordering::Equal {
+            return None;
+        }
+        let direction = *self.direction.get_or_insert(step);
+        (step != direction).then_some(last)
+    }
+}
+
+/// The index of the first sweep after which the numbers of the file names go the other way, see
+/// [`SweepOrder`]. None if they rise or fall throughout.
 ///
 /// ```
 /// use fnsf::formats::turning_sweep;
@@ -41,26 +75,9 @@ pub fn compare_names(one: &str, other: &str) -> Ordering {
 /// assert_eq!(turning_sweep(&["1.pcd", "2.pcd", "10.pcd"]), None);
 /// ```
 pub fn turning_sweep(names: &[&str]) -> Option<usize> {
-    let parts: Vec<_> = names.iter().map(|name| parts(name)).collect();
-    let (first, rest) = parts.split_first()?;
-    let comparable =
-        |other: &(Vec<&str>, Vec<&str>)| other.0 == first.0 && other.1.len() == first.1.len();
-    if !rest.iter().all(comparable) {
-        return None;
-    }
-    let mut direction = Ordering::Equal;
-    for (index, pair) in parts.windows(2).enumerate() {
-        let numbers = pair[0].1.iter().zip(&pair[1].1);
-        let step = numbers.map(|(a, b)| compared(a, b));
-        let step = step.fold(Ordering::Equal, Ordering::then);
-        if step == direction.reverse() && step != Ordering::Equal {
-            return Some(index);
-        }
-        if direction == Ordering::Equal {
-            direction = step;
-        }
-    }
-    None
+    let mut order = SweepOrder::default();
+    let after = names.iter().position(|name| order.push(name).is_some())?;
+    Some(after - 1)
 }
 
 #[cfg(test)]
@@ -95,6 +112,9 @@ mod tests {
             (&["1.pcd", "1.pcd", "2.pcd"], None),
             (&["source.ply", "target.ply"], None),
             (&["before.ply", "after.ply", "b4.ply"], None),
+            (&["a_1.ply", "a_2.ply", "b_1.ply", "b_2.ply"], None),
+            (&["map.ply", "1.ply", "10.ply", "2.ply"], Some(2)),
+            (&["1.ply", "2.ply", "2.ply", "1.ply"], Some(2)),
             (
                 &["9.bin", "1532402927647951.bin", "1532402927697731.bin"],
                 None,

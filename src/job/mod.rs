@@ -27,4 +27,4 @@ pub use labels::Labels;
 pub use notice::ended_notice;
 pub use options::JobOptions;
 pub use record::{Job, JobError, JobProgress, Kind, State};
-pub use report::{DenseReport, PhaseSeconds, Report};
+pub use report::{DenseReport, PhaseSeconds, Report, warnings};

@@ -245,8 +245,8 @@ fn decimal(seconds: f32) -> f64 {
     shortest.unwrap_or_else(|_| seconds.into())
 }
 
-/// The warnings of a report.
-fn warnings(estimate: &Estimate) -> Vec<String> {
+/// What is suspicious about the sweeps of an estimate, in words.
+pub fn warnings(estimate: &Estimate) -> Vec<String> {
     let same = estimate
         .same_sweep
         .then(|| "both sweeps are the same points".to_owned());

@@ -10,7 +10,7 @@ use super::report::{Outcome, RowReport};
 use super::types::Solver;
 use crate::flow::tracks::{Tracker, push_and_correct};
 use crate::flow::{
-    Control, Ego, Estimate, FlowError, Method, Options, Point, Problem, Sweep, WindowedPair,
+    Control, Estimate, FlowError, Method, Options, Point, Problem, Sweep, WindowedPair,
     neighbor_cost, predict_cost, window,
 };
 use crate::formats::{SweepClock, pair_interval_s, read_av2_mask, write_tracks};
@@ -125,16 +125,17 @@ impl Estimates<'_> {
         let mask = self.mask(wanted)?;
         let pair = [wanted.pair, wanted.pair + 1];
         let [source, target] = pair.map(|index| loaded(index).expect("both sweeps were read"));
+        let refused = [source, target].map(|loaded| loaded.refused_times.clone());
+        report.warnings.extend(refused.into_iter().flatten());
         let apart_s = self.interval_s(wanted, [source.clock, target.clock]);
         let mut options = inputs.options.clone();
         options.dt_s = options.dt_s.or(apart_s.map(f32::abs));
         let larger = source.points.len().max(target.points.len());
         let mut solver_options = options.solver_options(larger);
         solver_options.newest_first = apart_s.is_some_and(f32::is_sign_negative);
-        if inputs.poses {
-            let poses = pair.map(|index| drive.sweeps[index].pose.unwrap_or_default());
-            solver_options.ego = Ego::Given(poses[1].inv_mul(&poses[0]));
-        }
+        let pose = |index: usize| drive.sweeps[index].pose.unwrap_or_default();
+        let poses = inputs.poses.then(|| pair.map(pose));
+        solver_options.ego = solver_options.ego.of_pair(poses, false);
         let windowed = WindowedPair {
             pair: wanted.pair,
             count,

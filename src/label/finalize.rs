@@ -90,7 +90,7 @@ pub fn finalize(
         let mut table = csv::Writer::from_writer(Vec::new());
         let heading = [
             "key", "source", "target", "outcome", "error", "seconds", "points", "moving",
-            "overlap", "deskewed", "left_out",
+            "overlap", "deskewed", "left_out", "warnings",
         ];
         let unwritten = |error: csv::Error| LabelError::Machine(std::io::Error::other(error));
         table.write_record(heading).map_err(unwritten)?;
@@ -141,6 +141,7 @@ pub fn finalize(
                         true => of.left_out.len().to_string(),
                         false => "0".to_owned(),
                     })),
+                    number(report.map(|of| of.warnings.join("; "))),
                 ])
                 .map_err(unwritten)?;
         }

@@ -1,6 +1,5 @@
 //! Reading and writing of a run, with patience for stores that fail.
 
-use std::fmt::Display;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -46,6 +45,8 @@ pub(super) struct Loaded {
     pub(super) sweep: Sweep,
     pub(super) points: Arc<[Point]>,
     pub(super) clock: Option<SweepClock>,
+    /// Why the times of its points are not used, and its URI.
+    pub(super) refused_times: Option<String>,
 }
 
 /// Why a sweep was not read.
@@ -113,13 +114,12 @@ impl Io<'_> {
             reason: error.to_string(),
         })?;
         let name = uri.rsplit('/').next();
-        let unread = |error: &dyn Display| Unread {
-            may_pass: false,
-            reason: format!("{uri}: {error}"),
-        };
         let read = isolated("its reader", || read_timed_cloud(&bytes, name));
-        let read = read.map_err(|error| unread(&error))?;
-        let read = read.map_err(|error| unread(&error))?;
+        let read = read.and_then(|read| read.map_err(|error| error.to_string()));
+        let read = read.map_err(|reason| Unread {
+            may_pass: false,
+            reason: format!("{uri}: {reason}"),
+        })?;
         let clock = read.times.as_ref().map(PointTimes::clock);
         let sweep = Sweep {
             points: read.cloud.points,
@@ -134,6 +134,7 @@ impl Io<'_> {
             points: sweep.points.as_slice().into(),
             sweep,
             clock,
+            refused_times: read.refused_times.map(|reason| format!("{uri}: {reason}")),
         })
     }
 
@@ -239,11 +240,9 @@ impl Io<'_> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::layout::Layout;
     use super::super::manifest::read_manifest;
     use super::super::places::Place;
     use super::super::plan::Plan;
-    use super::super::shard::Shard;
     use super::*;
     use crate::job::JobOptions;
 
@@ -254,18 +253,9 @@ mod tests {
         let place = Place::open(&folder.path().to_string_lossy()).expect("a place");
         let manifest = "drive,sweep\nd,0.pcd\nd,1.pcd\n";
         let drives = read_manifest(manifest.into(), None).expect("a drive");
-        let inputs = Inputs {
-            plan: &Plan::new(drives).expect("a plan"),
-            options: &JobOptions::default(),
-            layout: Layout::default(),
-            poses: false,
-            tracks: false,
-            masks: None,
-            ignore_times: false,
-            most_bytes: usize::MAX,
-            shard: Shard::default(),
-            output: place.clone(),
-        };
+        let plan = Plan::new(drives).expect("a plan");
+        let options = JobOptions::default();
+        let inputs = Inputs::new(&plan, &options, place.clone());
         let runtime = Runtime::new().expect("a runtime");
         let io = Io {
             inputs: &inputs,

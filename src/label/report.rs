@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::flow::Estimate;
+use crate::job::warnings;
 
 /// What became of a pair.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -66,6 +67,9 @@ pub struct RowReport {
     /// Sweeps around the pair that could not be read, and were left out.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub left_out: Vec<String>,
+    /// What is suspicious about its sweeps, in words.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub warnings: Vec<String>,
 }
 
 impl RowReport {
@@ -85,6 +89,7 @@ impl RowReport {
             tracks: false,
             was_there: false,
             left_out: Vec::new(),
+            warnings: Vec::new(),
         }
     }
 
@@ -95,6 +100,7 @@ impl RowReport {
         let objects = estimate.objects();
         self.moving = objects.map(|of| of.clusters.iter().filter(|one| one.dynamic).count());
         self.overlap = estimate.overlap;
+        self.warnings.extend(warnings(estimate));
         let deskew = estimate.deskew.as_ref();
         self.deskewed = deskew.map(|deskew| deskew.points.is_some());
         self

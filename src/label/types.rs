@@ -36,6 +36,24 @@ pub struct Inputs<'a> {
     pub output: Place,
 }
 
+impl<'a> Inputs<'a> {
+    /// A run over all pairs of a plan, in the default layout, with any amount of memory.
+    pub fn new(plan: &'a Plan, options: &'a JobOptions, output: Place) -> Self {
+        Self {
+            plan,
+            options,
+            layout: Layout::default(),
+            poses: false,
+            tracks: false,
+            masks: None,
+            ignore_times: false,
+            most_bytes: usize::MAX,
+            shard: Shard::default(),
+            output,
+        }
+    }
+}
+
 /// Computes estimates, on a device that it may exchange.
 pub trait Solver {
     /// Does `work` on its device.

@@ -14,7 +14,7 @@ use super::control::JobControl;
 use super::run::Worker;
 use crate::clock::Timestamp;
 use crate::engine::Work;
-use crate::flow::{Ego, EnvelopeError, MotionField, Snapshot, Sweep, neighbor_at};
+use crate::flow::{EnvelopeError, MotionField, Snapshot, Sweep, neighbor_at};
 use crate::formats::SweepTime;
 use crate::job::{Job, JobOptions, State};
 use crate::payload::{CorruptPayload, StoredCloud};
@@ -76,12 +76,8 @@ impl Worker {
             snapshots,
         );
         let mut solver = options.solver_options(points);
-        if let Some((source, target)) = source.pose.zip(target.pose) {
-            solver.ego = Ego::Given(target.inv_mul(&source));
-        } else if job.backward {
-            // The given ego motion is from the earlier sweep to the later one.
-            solver.ego = solver.ego.reversed();
-        }
+        let poses = source.pose.zip(target.pose).map(<[_; 2]>::from);
+        solver.ego = solver.ego.of_pair(poses, job.backward);
         let work = Work {
             options: solver,
             before,

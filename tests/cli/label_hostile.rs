@@ -7,8 +7,9 @@ use std::sync::atomic::AtomicBool;
 use fnsf::flow::cpu::CpuBackend;
 use fnsf::flow::field::Backend;
 use fnsf::flow::{Estimate, FlowError, Uncontrolled};
+use fnsf::formats::read_cloud;
 use fnsf::job::JobOptions;
-use fnsf::label::{Inputs, Layout, Place, Shard, Solver, open_plan, run};
+use fnsf::label::{Inputs, Place, Solver, open_plan, run};
 
 use super::label::{drives, label, labels};
 
@@ -196,6 +197,37 @@ impl Solver for Panicking {
 }
 
 #[test]
+fn times_that_are_not_used_are_told_with_each_label() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    drives(folder, 1, "3");
+    let sweep = folder.join("drives/d0/sweep_0001.pcd");
+    let read = fs::read(&sweep).expect("a sweep");
+    let points = read_cloud(&read, None).expect("a cloud").points;
+    let mut timed = format!(
+        "VERSION .7\nFIELDS x y z time\nSIZE 4 4 4 8\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH {0}\nHEIGHT 1\n\
+         POINTS {0}\nDATA ascii\n",
+        points.len()
+    );
+    for (row, [x, y, z]) in points.iter().enumerate() {
+        let time = if row == 5 {
+            f64::NAN
+        } else {
+            row as f64 * 1e-6
+        };
+        timed += &format!("{x} {y} {z} {time}\n");
+    }
+    fs::write(&sweep, timed).expect("written");
+    for end in [&["--preset", "default"][..], &["--finalize"]] {
+        let done = label(folder, &[&["drives", "-o", "labels"], end].concat());
+        assert_eq!(done.code, 0, "{}", done.stderr);
+    }
+    let table = fs::read_to_string(folder.join("labels/_report.csv")).expect("written");
+    let told = "sweep_0001.pcd: its column time is NaN or infinite in row 5";
+    assert_eq!(table.matches(told).count(), 2, "{table}");
+}
+
+#[test]
 fn a_pair_whose_estimate_panics_is_refused_and_the_others_are_labelled() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
@@ -203,18 +235,9 @@ fn a_pair_whose_estimate_panics_is_refused_and_the_others_are_labelled() {
     let place = |name: &str| folder.join(name).to_string_lossy().into_owned();
     fs::create_dir(place("labels")).expect("a folder");
     let plan = open_plan(&place("drives")).expect("a drive");
-    let inputs = Inputs {
-        plan: &plan,
-        options: &JobOptions::default(),
-        layout: Layout::default(),
-        poses: false,
-        tracks: false,
-        masks: None,
-        ignore_times: false,
-        most_bytes: 1 << 30,
-        shard: Shard::default(),
-        output: Place::open(&place("labels")).expect("a place"),
-    };
+    let options = JobOptions::default();
+    let output = Place::open(&place("labels")).expect("a place");
+    let inputs = Inputs::new(&plan, &options, output);
     let mut solver = Panicking { at: 2, solved: 0 };
     let goes_on = AtomicBool::new(false);
     let done = run(&inputs, &mut solver, &Uncontrolled, &goes_on, &mut |_| {});

@@ -402,8 +402,18 @@ fn rolling_sweeps_are_deskewed_and_their_flow_starts_from_the_deskewed_points() 
     assert!(apart(&points("street/sweep_0000.pcd"), &truth) > 0.5);
     let report = run(&["--deskew", "off", "-o", "raw.ply"]);
     assert!(report.get("deskew").is_none(), "{report}");
+    assert_eq!(report["dt_s"], dt_s, "the times are those of the sensor");
     let raw = error("raw.ply");
     assert!(raw > 3.0 * deskewed, "{raw} {deskewed}");
+    let [_, earlier, later] = sweeps;
+    let view = ["view", earlier, later, later, "--flow", "flow.ply"];
+    let view = fnsf(folder, &view);
+    assert_eq!(view.code, 2, "{}", view.stderr);
+    assert!(
+        view.stderr.contains("of deskewed sweeps"),
+        "{}",
+        view.stderr
+    );
 }
 
 #[test]

@@ -332,7 +332,14 @@ async fn submissions_and_sequences_out_of_order_are_refused() {
             idempotency_key: key.to_owned(),
         }))
     };
-    let next = Some(Part::Next(NextCloud::default()));
+    let named = |name: &str| {
+        let name = name.to_owned();
+        Some(Part::Next(NextCloud {
+            name,
+            ..NextCloud::default()
+        }))
+    };
+    let next = named("");
     let piece = Some(Part::Chunk(chunk(&small_pair()[0])));
     for case in [
         vec![],
@@ -346,7 +353,23 @@ async fn submissions_and_sequences_out_of_order_are_refused() {
         vec![begin(""), next.clone()],
         vec![begin(""), next.clone(), piece.clone()],
         vec![begin(""), next.clone(), next.clone(), next.clone()],
+        vec![
+            begin(""),
+            named(&"1".repeat(256)),
+            piece.clone(),
+            next.clone(),
+            piece.clone(),
+        ],
         vec![begin(""), next.clone(), piece.clone(), next.clone()],
+        vec![
+            begin(""),
+            named("1"),
+            piece.clone(),
+            named("10"),
+            piece.clone(),
+            named("2"),
+            piece.clone(),
+        ],
     ] {
         let told = format!("{case:?}").chars().take(200).collect::<String>();
         let messages = case

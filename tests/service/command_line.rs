@@ -55,19 +55,26 @@ fn sweeps_are_submitted_and_jobs_listed_shown_cancelled_requeued_and_removed() {
     run(&["submit", "a.pcd", "b.pcd", "c.pcd", "-o", "flows.zip"]);
     let zip = std::fs::read(folder.path().join("flows.zip")).expect("flows");
     assert!(zip.starts_with(b"PK"));
-    // A dense cloud of two sweeps.
-    let dense = r#"{"densify": {"reference_time": 1}}"#;
-    run(&[
-        "submit",
-        "a.pcd",
-        "b.pcd",
-        "--options",
-        dense,
-        "-o",
-        "dense.npz",
-    ]);
-    let dense = std::fs::read(folder.path().join("dense.npz")).expect("a dense cloud");
+    // A dense cloud of two sweeps, which have more points than are drawn only before they are cropped.
+    let drawn = (small_pair()[0].len() - 1).to_string();
+    let dense = format!(
+        r#"{{"crop_m": 20, "max_points": {drawn}, "densify": {{"reference_time": 1}}, "seed": 3}}"#
+    );
+    let sweeps = ["a.pcd", "b.pcd", "-o"];
+    let submit = ["submit", "--preset", "neural", "--options", &dense];
+    let submit = [&submit, &sweeps[..]].concat();
+    run(&[&submit[..], &["dense.npz"]].concat());
+    let options = ["--crop-m", "20", "--max-points", &drawn, "--seed", "3"];
+    let densify = ["densify", "--preset", "neural", "--reference-time", "1"];
+    let densify = [&densify[..], &options, &sweeps].concat();
+    run(&[&densify[..], &["local.npz"]].concat());
+    let [dense, local] = ["dense.npz", "local.npz"]
+        .map(|path| std::fs::read(folder.path().join(path)).expect("a dense cloud"));
     assert!(fnsf::formats::is_dense(&dense));
+    assert!(
+        dense == local,
+        "the server's dense cloud is not that of the command line"
+    );
 
     // A job that lasts, one behind it, and their cancellation.
     let long = r#"{"field": {"max_iterations": 1000000, "patience": 1000000}}"#;

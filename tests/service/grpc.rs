@@ -199,6 +199,8 @@ async fn a_sequence_is_answered_pair_by_pair_while_it_is_still_coming() {
 async fn jobs_are_submitted_watched_listed_and_downloaded() {
     use proto::download_result_response::Part as Result;
     use proto::submit_job_request::{Begin, NextCloud, Part};
+    /// The second sweep is 50 ms later.
+    const NAMES: [&str; 2] = ["1700000000000", "1700000000050"];
     let server = Server::start(&[]);
     let mut calls = client(&server).await;
     let message = |part| proto::SubmitJobRequest { part: Some(part) };
@@ -207,8 +209,11 @@ async fn jobs_are_submitted_watched_listed_and_downloaded() {
             options: None,
             idempotency_key: "key".to_owned(),
         })];
-        for points in small_pair() {
-            parts.push(Part::Next(NextCloud::default()));
+        for (points, name) in small_pair().iter().zip(NAMES) {
+            parts.push(Part::Next(NextCloud {
+                name: name.to_owned(),
+                ..NextCloud::default()
+            }));
             parts.extend(points.chunks(1000).map(|points| Part::Chunk(chunk(points))));
         }
         tokio_stream::iter(parts.into_iter().map(message))
@@ -245,12 +250,39 @@ async fn jobs_are_submitted_watched_listed_and_downloaded() {
             .into_inner();
         let mut rows = 0;
         while let Some(part) = parts.next().await {
-            if let Some(Result::Chunk(piece)) = part.expect("a part").part {
-                rows += piece.flow.len() as u64 / 12;
+            match part.expect("a part").part {
+                Some(Result::Chunk(piece)) => rows += piece.flow.len() as u64 / 12,
+                Some(Result::Header(header)) => {
+                    assert_eq!((header.dt_s, header.dt_assumed), (0.05, false));
+                }
+                other => panic!("{other:?}"),
             }
         }
         assert_eq!(rows, small_pair()[0].len() as u64 - first_row);
     }
+}
+
+#[tokio::test]
+async fn a_row_of_three_nan_is_a_beam_without_return() {
+    use proto::estimate_flow_response::Part;
+    let server = Server::start(&[]);
+    let mut clouds = small_pair().clone();
+    clouds[0][7] = [f32::NAN; 3];
+    let sent = pair(&clouds, proto::Options::default());
+    let answer = client(&server).await.estimate_flow(sent).await;
+    let mut answer = answer.expect("an answer").into_inner();
+    let (mut flow, mut flags) = (Vec::new(), Vec::new());
+    while let Some(message) = answer.next().await {
+        if let Some(Part::Chunk(piece)) = message.expect("a message").part {
+            flow.extend(points_from_le_bytes(&piece.flow));
+            flags.extend(piece.flags);
+        }
+    }
+    assert_eq!((flow.len(), flow[7]), (clouds[0].len(), [0.0; 3]));
+    let invalid: Vec<usize> = (0..flags.len())
+        .filter(|&row| flags[row] & 1 == 0)
+        .collect();
+    assert_eq!(invalid, [7]);
 }
 
 #[tokio::test]
@@ -289,7 +321,7 @@ async fn refusals_carry_their_reason() {
     assert_eq!(status.code(), Code::NotFound);
     let code = status.metadata().get("fnsf-code").expect("a code");
     assert_eq!(code, "not_found");
-    let nan = [vec![[f32::NAN; 3]; 10], vec![[0.0; 3]; 10]];
+    let nan = [vec![[0.0, 0.0, f32::NAN]; 10], vec![[0.0; 3]; 10]];
     let stream = pair(&nan, proto::Options::default());
     let status = calls.estimate_flow(stream).await.expect_err("a refusal");
     assert_eq!(status.code(), Code::InvalidArgument);

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use fnsf::flow::densify::{self as dense, FieldStep, FlowEdge, estimate_fields};
-use fnsf::flow::{DenseCloud, Ego, FlowError, MotionField, RigidTransform, Sweep};
+use fnsf::flow::{DenseCloud, FlowError, MotionField, RigidTransform, Sweep};
 use fnsf::formats::{self, DenseFormat};
 use numpy::PyReadonlyArray1;
 use pyo3::prelude::*;
@@ -14,17 +14,12 @@ use crate::errors::{input, internal};
 use crate::estimate::{Place, options_of, solver_options};
 use crate::supervision::{Watch, supervised, supervised_on_threads};
 
-/// The motion of the sensor from sweep `source` to sweep `target`, by their poses.
-fn ego(poses: &[RigidTransform], [source, target]: [usize; 2]) -> Ego {
-    Ego::Given(poses[target].inv_mul(&poses[source]))
-}
-
-/// The motion fields of the plan.
+/// The motion fields of the plan. `points` are the numbers of points of the sweeps before they were cropped.
 fn fields(
     py: Python<'_>,
     place: &mut Place,
     plan: &dense::Plan,
-    sweeps: &[Sweep],
+    (sweeps, points): (&[Sweep], &[usize]),
     poses: Option<&[RigidTransform]>,
     told: Option<&Bound<'_, PyAny>>,
 ) -> PyResult<BTreeMap<FlowEdge, MotionField>> {
@@ -40,14 +35,10 @@ fn fields(
             if let Some(told) = told {
                 told.call1((done, pairs, py.None()))?;
             }
-            let counts = [before, index].map(|sweep| sweeps[sweep].points.len());
+            let counts = [before, index].map(|sweep| points[sweep]);
             let mut solver = solver_options(&options, counts);
-            if let Some(poses) = poses {
-                solver.ego = ego(poses, [before, index]);
-            } else if before > index {
-                // The given ego motion is from the earlier sweep to the later one.
-                solver.ego = solver.ego.reversed();
-            }
+            let poses = poses.map(|poses| [poses[before], poses[index]]);
+            solver.ego = solver.ego.of_pair(poses, before > index);
             place.run(py, &watch, None, |backend| {
                 sequence.push(backend, sweeps[index].clone(), &solver, &watch)
             })
@@ -107,6 +98,7 @@ pub(crate) fn densify<'py>(
         })
     });
     let taken: Vec<Sweep> = taken.collect::<PyResult<_>>()?;
+    let counts: Vec<usize> = taken.iter().map(|sweep| sweep.points.len()).collect();
     let watch = Watch::new(None)?;
     let taken: Vec<Sweep> = supervised_on_threads(py, &watch, || {
         let prepared = taken.into_iter().map(|sweep| sweep.prepared(&solver));
@@ -114,7 +106,8 @@ pub(crate) fn densify<'py>(
     })?;
     let mut place = Place::open(py, device, threads, options)?;
     let told = progress.as_ref();
-    let fields = fields(py, &mut place, &plan, &taken, poses.as_deref(), told)?;
+    let of_sweeps = (taken.as_slice(), counts.as_slice());
+    let fields = fields(py, &mut place, &plan, of_sweeps, poses.as_deref(), told)?;
     let watch = Watch::new(None)?;
     let cloud = place.run(py, &watch, None, |backend| {
         let field = |edge: FlowEdge| fields.get(&edge);

@@ -269,7 +269,8 @@ impl SceneFlow for Calls {
                     let pose = requests::pose("the next cloud", &next.pose)?;
                     push(&mut pending, cloud.take(), &index, &mut room).await?;
                     if next.uri.is_empty() {
-                        cloud = Some(CloudBuilder::with_pose(pose));
+                        cloud = Some(CloudBuilder::named(&next.name)?.with_pose(pose));
+                        order.push(&next.name, force)?;
                     } else {
                         let index = format!("cloud {}", pending.sweeps());
                         let (name, bytes) = service.fetch(&mut room, &index, &next.uri).await?;

@@ -15,7 +15,11 @@ use crate::api::results::Answer;
 use crate::api::service::Service;
 use crate::api::upload_budget::UploadReservation;
 use crate::flow::{DenseCloud, Point, RigidTransform};
+use crate::formats::SweepTime;
 use crate::payload::{StoredCloud, points_from_le_bytes};
+
+/// Maximum length of the name of a sweep, bytes. Each pair and some errors repeat the name.
+const MAX_NAME: usize = 255;
 
 /// Rows of flow, or of a dense cloud, in one chunk: about 25 kB with all columns. An answer that is
 /// not read keeps some chunks in memory that no budget has, so they are small.
@@ -54,15 +58,28 @@ pub(super) struct CloudBuilder {
     points: Vec<u8>,
     ground: Vec<bool>,
     pose: Option<RigidTransform>,
+    time: Option<SweepTime>,
 }
 
 impl CloudBuilder {
-    /// A cloud with the pose `world_from_sensor`, or none.
-    pub(super) fn with_pose(pose: Option<RigidTransform>) -> Self {
-        Self {
-            pose,
-            ..Self::default()
+    /// A cloud with a name, or without one where it is empty. A timestamp in it is the time of the cloud.
+    ///
+    /// # Errors
+    /// [`ApiError::BadRequest`] for a name of more than [`MAX_NAME`] bytes.
+    pub(super) fn named(name: &str) -> Result<Self, ApiError> {
+        if name.len() > MAX_NAME {
+            let text = format!("the name of a sweep has more than {MAX_NAME} bytes");
+            return Err(ApiError::BadRequest(text));
         }
+        Ok(Self {
+            time: SweepTime::from_name(name),
+            ..Self::default()
+        })
+    }
+
+    /// With the pose `world_from_sensor`, or none.
+    pub(super) fn with_pose(self, pose: Option<RigidTransform>) -> Self {
+        Self { pose, ..self }
     }
 
     /// Adds a chunk. `part` is the name of the cloud for error messages.
@@ -126,7 +143,7 @@ impl CloudBuilder {
             points,
             ground,
             pose: self.pose,
-            ..StoredCloud::default()
+            time: self.time,
         })
     }
 }

@@ -23,15 +23,11 @@ use crate::api::service::{Service, Waited};
 use crate::api::sweep_order::SweepOrder;
 use crate::api::upload_budget::{MessageMemory, UploadReservation};
 use crate::flow::{is_window_final, window};
-use crate::formats::SweepTime;
 use crate::job::{JobId, JobOptions, Kind};
 use crate::payload::StoredCloud;
 use crate::queue::PairOf;
 
 type ResultBudget = mpsc::Sender<Result<proto::EstimateSequenceResponse, Status>>;
-
-/// Maximum length of the name of a sweep, bytes. Each pair and some errors repeat the name.
-const MAX_NAME: usize = 255;
 
 /// A pair that has been submitted.
 struct Pending {
@@ -69,8 +65,7 @@ struct Coming {
 
 impl Coming {
     fn finish(self, room: UploadReservation) -> Result<Sweep, ApiError> {
-        let mut cloud = self.cloud.finish(&self.name)?;
-        cloud.time = SweepTime::from_name(&self.name);
+        let cloud = self.cloud.finish(&self.name)?;
         if let Some(points) = self.points
             && points != cloud.points.len() as u64
         {
@@ -183,12 +178,9 @@ impl Reader {
                     let all = coming.points.is_some_and(|points| cloud.points() >= points);
                     if all { current.take() } else { None }
                 }
-                Some(Part::Sweep(sweep)) if sweep.name.len() > MAX_NAME => {
-                    let text = format!("the name of a sweep has more than {MAX_NAME} bytes");
-                    return Err(ApiError::BadRequest(text));
-                }
                 Some(Part::Sweep(sweep)) => current.replace(Coming {
-                    cloud: CloudBuilder::with_pose(requests::pose(&sweep.name, &sweep.pose)?),
+                    cloud: CloudBuilder::named(&sweep.name)?
+                        .with_pose(requests::pose(&sweep.name, &sweep.pose)?),
                     name: sweep.name,
                     points: sweep.points,
                 }),

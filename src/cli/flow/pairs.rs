@@ -90,10 +90,10 @@ impl<'a> Pairs<'a> {
     /// Reads the next sweep, with the times of its points unless they are not asked for.
     pub(super) fn read(&mut self, path: &Path) -> Result<(Sweep, Taken), Failure> {
         let began = self.terminal.seconds();
-        let sweep = match self.flow.deskew {
-            DeskewChoice::Off => self.surroundings.sweep(self.sweeps, path)?,
-            _ => self.surroundings.timed_sweep(self.sweeps, path)?,
-        };
+        let mut sweep = self.surroundings.sweep(self.sweeps, path)?;
+        if self.flow.deskew == DeskewChoice::Off {
+            sweep.times = None;
+        }
         if self.flow.deskew == DeskewChoice::On && sweep.times.is_none() {
             let path = path.display();
             return Err(Failure::usage(anyhow!(

@@ -145,12 +145,15 @@ pub enum Ego {
 }
 
 impl Ego {
-    /// The ego motion of the pair with its sweeps exchanged.
+    /// The choice for a pair of a sequence. `poses` are the poses world_from_sensor of its source and
+    /// target, where they are known. Otherwise a given motion leads from the earlier sweep to the later one.
+    /// A pair that `leads_back` has the later sweep as its source, and gets the inverse.
     #[must_use]
-    pub fn reversed(self) -> Self {
-        match self {
-            Self::Given(motion) => Self::Given(motion.inverse()),
-            other => other,
+    pub fn of_pair(self, poses: Option<[RigidTransform; 2]>, leads_back: bool) -> Self {
+        match (poses, self) {
+            (Some([source, target]), _) => Self::Given(target.inv_mul(&source)),
+            (None, Self::Given(motion)) if leads_back => Self::Given(motion.inverse()),
+            (None, choice) => choice,
         }
     }
 }

@@ -162,7 +162,7 @@ impl<'a> PointCloud<'a> {
                 }
                 points.push(checked);
                 if let (Some(column), Some(time)) = (&mut column, time) {
-                    column.push(KIND, row, value(time))?;
+                    column.push(value(time));
                 }
             }
         }

@@ -37,7 +37,6 @@ impl CloudMessage<'_> {
     /// - `Malformed` for a message that contradicts itself or is cut off.
     /// - `Missing` without fields x, y and z.
     /// - `OutOfRange` for a coordinate over 1e6 m in magnitude.
-    /// - `NotFinite` for a point with a time that is not finite.
     /// - `TooLarge` for more than [`MAX_POINTS`](crate::formats::MAX_POINTS) points.
     pub fn sweep(&self) -> Result<RecordedSweep, FormatError> {
         PointCloud::read(self.data, self.alignment)?.sweep()

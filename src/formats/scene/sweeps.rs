@@ -110,7 +110,7 @@ impl Scene {
     /// - `Malformed` for a file that violates the format.
     /// - `Missing` without `lidar`.
     /// - `Unsupported` for an array of another shape, or of anything but numbers and booleans.
-    /// - `NotFinite` and `OutOfRange` for a coordinate that is none, `NotFinite` for a time.
+    /// - `NotFinite` and `OutOfRange` for a coordinate that is none.
     /// - `TooLarge` for more than [`MAX_POINTS`](crate::formats::MAX_POINTS) points, or an array of more
     ///   bytes than the file may unfold to.
     /// - `RowCount` for an array that does not have a row for each point.
@@ -127,7 +127,7 @@ impl Scene {
             let mut times = TimesColumn::named("lidar_dt");
             for row in 0..array.rows {
                 let [time] = array.row(row);
-                times.push(KIND, row, time)?;
+                times.push(time);
             }
             column = Some(times);
         }
