@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use fnsf::flow::field::{Backend, BackendError};
 use fnsf::flow::{
-    Estimate, FlowError, MotionField, Options, Point, Problem, Residual, estimate as solve,
+    Estimate, FlowError, Ground, MotionField, Options, Point, Problem, Residual, estimate as solve,
 };
 use fnsf::formats::{SweepClock, pair_interval_s};
 use fnsf::job::{JobOptions, Report};
@@ -70,6 +70,13 @@ impl Place {
 /// Reads options of the JSON object of the service.
 pub(crate) fn options_of(json: &str) -> PyResult<JobOptions> {
     JobOptions::from_json(json.as_bytes()).map_err(input)
+}
+
+/// Whether an estimate takes ground points as any others. It then ignores masks.
+#[pyfunction]
+pub(crate) fn keeps_ground(options: &str) -> PyResult<bool> {
+    let options = options_of(options)?;
+    Ok(options.solver_options(0).ground == Ground::Keep)
 }
 
 /// The options of the solver for two clouds.

@@ -33,6 +33,7 @@ pub(crate) fn read_sweep<'py>(
     answer.set_item("times", offsets)?;
     answer.set_item("time", times.and_then(|times| times.sweep_s))?;
     answer.set_item("duration", times.map(|times| times.duration_s))?;
+    answer.set_item("refused_times", &read.refused_times)?;
     Ok(answer)
 }
 

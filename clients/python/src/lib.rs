@@ -44,6 +44,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(device::device_name, module)?)?;
     module.add_function(wrap_pyfunction!(estimate::estimate, module)?)?;
     module.add_function(wrap_pyfunction!(estimate::check_options, module)?)?;
+    module.add_function(wrap_pyfunction!(estimate::keeps_ground, module)?)?;
     module.add_function(wrap_pyfunction!(estimate::pair_interval, module)?)?;
     module.add_function(wrap_pyfunction!(dense::densify, module)?)?;
     module.add_function(wrap_pyfunction!(dense::write_dense, module)?)?;

@@ -120,8 +120,12 @@ impl Sequence {
         if matches!(options.ego, Some(EgoChoice::Given(_))) {
             return Err(input("ego is the motion of one pair: give it to push"));
         }
-        if track && !matches!(options.solver_options(0).method, Method::Objects(_)) {
+        let solver = options.solver_options(0);
+        if track && !matches!(solver.method, Method::Objects(_)) {
             return Err(input(TrackError::NoObjects));
+        }
+        if track && solver.ego == Ego::Off {
+            return Err(input(TrackError::NoEgoMotion));
         }
         Ok(Self(Mutex::new(State {
             place: Place::open(py, device, threads, options)?,
@@ -180,10 +184,12 @@ impl Sequence {
         let larger = count.max(state.last.as_ref().map_or(0, |(last, _)| last.len()));
         let mut solver = options.solver_options(larger);
         if let Some(ego) = ego {
+            if solver.ego == Ego::Off {
+                return Err(input(
+                    "this sequence has ego=\"off\", so that push takes no ego",
+                ));
+            }
             solver.ego = Ego::Given(motion("ego", &ego)?);
-        }
-        if state.tracker.is_some() && state.last.is_some() && solver.ego == Ego::Off {
-            return Err(input(TrackError::NoEgoMotion));
         }
         let time_s = match state.last {
             Some(_) => state.time_s + f64::from(solver.dt_s),
@@ -218,10 +224,17 @@ impl Sequence {
         while !state.waiting.is_empty() {
             let estimates = state.run(py, &watch, progress.as_ref(), |sequence, backend| {
                 sequence.finish(backend, &watch)
-            })?;
-            if estimates.is_empty() {
-                break;
-            }
+            });
+            let estimates = match estimates {
+                // The flows before a pair that fails; the next call says why.
+                Err(error) if error.is_instance_of::<Error>(py) && !complete.is_empty() => break,
+                Err(error) => {
+                    state.is_cut |= !complete.is_empty();
+                    return Err(error);
+                }
+                Ok(estimates) if estimates.is_empty() => break,
+                Ok(estimates) => estimates,
+            };
             state.complete(py, estimates, &complete)?;
         }
         Ok(complete)

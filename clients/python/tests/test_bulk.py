@@ -47,6 +47,20 @@ def test_rows_that_cannot_be_used_are_refused(table, tmp_path):
         Labeller("x", ending="obj")
 
 
+def test_what_is_suspicious_about_a_pair_is_in_its_report(table, street, tmp_path):
+    points = street.sweep(1).points
+    head = f"FIELDS x y z time\nSIZE 4 4 4 8\nTYPE F F F F\nWIDTH {len(points)}\nHEIGHT 1\nDATA ascii\n"
+    rows = np.column_stack([points, np.linspace(0.0, 0.1, len(points))])
+    rows[5, 3] = np.nan
+    with open(table["source"][1], "w") as file:
+        file.write(head)
+        np.savetxt(file, rows)
+    report = Labeller(str(tmp_path / "labels"))(table)
+    assert list(report["outcome"]) == ["labelled"] * 3, report["error"]
+    told = [warnings.count("1.pcd: its column time is NaN or infinite in row 5") for warnings in report["warnings"]]
+    assert told == [1, 1, 0]
+
+
 def test_a_pair_whose_fit_diverges_is_refused(table, tmp_path):
     labeller = Labeller(
         str(tmp_path / "labels"), preset="nsfp-baseline", field={"learning_rate": 1e30, "max_iterations": 20}
@@ -64,6 +78,8 @@ def test_a_pair_whose_fit_diverges_is_refused(table, tmp_path):
         ({"deadline": 0}, fnsf.InputError, "deadline is 0"),
         ({"device": "gpux"}, fnsf.InputError, "gpux"),
         ({"times": ([], [])}, TypeError, "times"),
+        ({"ego": np.eye(4)}, fnsf.InputError, "motion of one pair"),
+        ({"ground": "mask"}, fnsf.InputError, "needs masks"),
     ],
 )
 def test_options_that_fit_no_pair_are_refused_at_the_start(tmp_path, options, error, said):

@@ -25,7 +25,16 @@ def test_the_flow_of_a_server_has_the_bits_of_the_library(server, pair):
     assert np.allclose(theirs.ego, ours.ego, rtol=1e-12, atol=1e-14)
     assert np.allclose(theirs.ego_covariance, ours.ego_covariance, rtol=1e-12, atol=0)
     assert theirs.stop_reason == ours.stop_reason and theirs.report["points"] == len(pair.source)
+    report, same = theirs.report, ["objects", "overlap", "warnings", "dt_s", "valid_points"]
+    assert [report.get(key) == ours.report.get(key) for key in same] == [True] * len(same), report
+    for key in ["ego_motion", "ego_covariance"]:
+        assert np.allclose(report[key], ours.report[key], rtol=1e-12, atol=1e-14), key
     theirs.save(server.folder / "flow.ply")
+    with server.client() as client:
+        theirs = client.flow(
+            pair.source, pair.target, preset="paper", ground=pair.masks, field={"max_iterations": 5}, deadline=60
+        )
+    assert not theirs.valid[pair.masks[0]].any() and theirs.valid[~pair.masks[0]].all()
 
 
 def test_refusals_have_the_code_of_the_server(server, pair):
@@ -117,6 +126,10 @@ def test_jobs_are_submitted_found_and_removed(server, pair, street):
         client.delete(job.id)
         with pytest.raises(ServerError):
             client.job(job.id)
+
+        named = [NamedSweep(points, name=name) for points, name in [(pair.source, "0.10"), (pair.target, "0.20")]]
+        with pytest.raises(ServerError, match="against the order"):
+            client.submit([*named, NamedSweep(pair.source, name="0.15")])
 
         sweeps = [street.sweep(index).points for index in range(len(street))]
         densify = {"reference_time": 1, "later_sweeps": "inverse"}

@@ -82,6 +82,9 @@ def test_masks_times_and_ego_motions_are_taken(street, pair):
     left_out = fnsf.flow(pair.source, pair.target, ground="keep", crop_m=20, min_range_m=3)
     far = np.abs(pair.source[:, :2]).max(axis=1) > 20
     assert not left_out.valid[far].any()
+    # The preset of the paper keeps the ground, but not that of masks.
+    cut = fnsf.flow(pair.source, pair.target, preset="paper", ground=pair.masks, field={"max_iterations": 5})
+    assert not cut.valid[pair.masks[0]].any() and cut.valid[~pair.masks[0]].all()
     timed = np.zeros(len(pair.source)), np.zeros(len(pair.target))
     assert fnsf.flow(pair.source, pair.target, times=timed).valid.all()
 

@@ -137,15 +137,27 @@ def test_what_no_sequence_can_be_asked_is_refused(street):
         lambda: fnsf.densify([pair.source, pair.target], 0, poses=poses, ego="off"),
         lambda: fnsf.Sequence(ego=pair.ego),
         lambda: fnsf.Sequence(track=True, preset="neural"),
+        lambda: fnsf.Sequence(track=True, ego="off"),
     ]:
         with pytest.raises(fnsf.InputError):
             refused()
-    sequence = fnsf.Sequence(track=True, preset="default", ego="off")
+    sequence = fnsf.Sequence(preset="default", ego="off")
     sequence.push(pair.source)
-    with pytest.raises(fnsf.InputError, match="tracks need the ego motion"):
-        sequence.push(pair.target)
-    # The motion of the pair may be given later.
-    assert len(sequence.push(pair.target, ego=pair.ego)) == 1
+    with pytest.raises(fnsf.InputError, match="push takes no ego"):
+        sequence.push(pair.target, ego=pair.ego)
+    assert len(sequence.push(pair.target)) == 1
+
+
+def test_flows_before_a_refused_pair_are_not_lost(street):
+    sequence = fnsf.Sequence()
+    other = fnsf.simulate(2, seed=99, beams=32, azimuth_steps=1000)
+    flows = []
+    for points in [street.sweep(0).points, street.sweep(1).points, street.sweep(2).points, other.sweep(1).points]:
+        flows += sequence.push(points)
+    flows += sequence.finish()
+    assert len(flows) == 2
+    with pytest.raises(fnsf.InputError, match="scene"):
+        sequence.finish()
 
 
 def test_poses_lead_a_dense_cloud(street):

@@ -63,7 +63,7 @@ def densify(
     Args:
         sweeps: two or more, N x 3 metres each, in the order in which they were recorded.
         reference_time: in sweeps from 0; 4.5 is half way from sweep 4 to sweep 5.
-        masks: the ground masks of the sweeps.
+        masks: the ground masks of the sweeps. Presets that keep the ground use them with `ground="mask"` alone.
         poses: the 4 x 4 poses world_from_sensor of the sweeps, where they are known.
         substeps: Euler steps from sweep to sweep, 1 to 64.
         later_sweeps: how sweeps after the reference time are moved: through flow estimated backward in time, or by the

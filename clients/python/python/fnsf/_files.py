@@ -33,6 +33,8 @@ class Sweep:
     """The sweep's time on the sensor's clock, seconds, where the file has it."""
     duration: float | None = None
     """Seconds from the first point to the last, where points have times."""
+    refused_times: str | None = None
+    """Why the file's column of times is not used, in words."""
 
     def __len__(self) -> int:
         return len(self.points)

@@ -156,6 +156,7 @@ def flow(
         pc2: M x 3 or more numbers: the target sweep, metres, in its own sensor's frame.
         preset: the method. `default` and `label` find rigid motions of objects, the others fit a field.
         ground: `auto`, `keep` or `mask`, as in `Options`; or the ground masks of both sweeps, N and M flags.
+            With masks, presets that keep the ground leave its points out.
         ego: `off`, `auto`, or the 4 x 4 matrix target_from_source where it is known.
         seed: of all random choices; the same seed gives the same bits.
         max_points: points that get a flow, drawn at random from a larger cloud.
@@ -181,7 +182,7 @@ def flow(
     if isinstance(ground, tuple):
         first, second = ground
         masks = (_arrays.mask("the ground mask of pc1", first), _arrays.mask("the ground mask of pc2", second))
-        ground = None
+        ground = _options.of_masks(preset)
     if times is not None:
         times = (_arrays.values("the times of pc1", times[0]), _arrays.values("the times of pc2", times[1]))
     options = _options.as_json(

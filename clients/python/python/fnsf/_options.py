@@ -8,7 +8,7 @@ from typing import Any, Literal, TypeAlias, TypedDict
 
 import numpy as np
 
-from . import _arrays
+from . import _arrays, _native
 from ._native import InputError
 
 Preset: TypeAlias = Literal[
@@ -68,6 +68,11 @@ def as_json(options: Mapping[str, Any], **more: Any) -> str:
         raise TypeError(f"no option {unknown[0]!r}; there are {', '.join(sorted(KNOWN))}")
     named = {name: _plain(name, value) for name, value in {**options, **more}.items() if value is not None}
     return json.dumps(named)
+
+
+def of_masks(preset: str | None) -> Literal["mask"] | None:
+    """The option `ground` of sweeps with masks: presets that keep the ground leave its points out."""
+    return "mask" if _native.keeps_ground(as_json({"preset": preset})) else None
 
 
 def _plain(name: str, value: Any) -> Any:

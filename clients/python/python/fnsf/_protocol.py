@@ -141,11 +141,23 @@ def flow(header: Any, pieces: list[Any], source: Points | None) -> Flow:
     )
     # 64-bit numbers are strings in protobuf's JSON.
     report.update(points=header.points, valid_points=header.valid_points)
+    if header.WhichOneof("method") == "objects":
+        report["objects"]["own_points"] = header.objects.own_points
+        report["objects"].setdefault("cost_m")
+    report["ego_motion"] = None if ego is None else ego.tolist()
+    if covariance:
+        report["ego_covariance"] = np.reshape(covariance, (6, 6)).tolist()
+    else:
+        report.pop("ego_covariance", None)
+    report.setdefault("overlap")
+    if not header.warnings:
+        report.pop("warnings", None)
     # The words of the program.
     report["stop_reason"] = plain(header, "stop_reason")
     if header.WhichOneof("method") == "field":
         unit = plain(header.field, "loss_unit")
         report["field"]["loss_unit"] = UNITS.get(unit, unit)
+        report["field"].setdefault("best_loss")
     return Flow(
         flow=_joined(pieces, "flow", "<f4").reshape(-1, 3),
         valid=(flags & 1).astype(bool),

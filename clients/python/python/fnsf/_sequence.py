@@ -52,12 +52,17 @@ class Sequence:
 
         Args:
             points: the sweep, in its sensor's frame.
-            ground: N flags: the ground points.
+            ground: N flags: the ground points. Presets that keep the ground use them with `ground="mask"` alone.
             times: N seconds after the sweep's time.
             ego: the 4 x 4 motion to this sweep's frame from that of the sweep before, where it is known.
             dt_s: seconds from the sweep before.
             deadline: seconds for this call, after which the best flow so far is returned.
             progress: as in `flow`.
+
+        Raises:
+            InputError: the sweep or the next pair is refused. The sequence is as before: the same sweep may be pushed
+                again, with other arguments. All flows before the pair have been returned. To go on, begin another
+                sequence with the sweeps after the pair.
         """
         answers = self._native.push(
             _arrays.points("points", points),
@@ -71,7 +76,10 @@ class Sequence:
         return [of_answer(answer) for answer in answers]
 
     def finish(self, *, deadline: float | None = None, progress: Progress | None = None) -> list[Flow]:
-        """Returns the remaining flows at the end of the sequence, in order."""
+        """Returns the remaining flows at the end of the sequence, in order.
+
+        They end before a pair that is refused; another call then raises why.
+        """
         answers = self._native.finish(deadline=deadline, progress=progress)
         return [of_answer(answer) for answer in answers]
 

@@ -24,7 +24,7 @@ from . import _native
 from ._files import MAX_FILE, Sweep
 from ._flow import check, flow
 
-COLUMNS = ("key", "source", "target", "outcome", "error", "seconds", "points", "moving")
+COLUMNS = ("key", "source", "target", "outcome", "error", "seconds", "points", "moving", "warnings")
 """The columns of the report."""
 ENDINGS = ("npz", "feather", "npy", "ply", "pcd", "json")
 
@@ -59,12 +59,16 @@ class Labeller:
     Args:
         output: folder or URI for the labels.
         ending: format of the labels: npz, feather, npy, ply, pcd or json.
-        options: as in `flow`.
+        options: as in `flow`, without an ego motion and masks of one pair.
     """
 
     def __init__(self, output: str, *, ending: str = "npz", **options: Any) -> None:
         if ending not in ENDINGS:
             raise _native.InputError(f"labels are {', '.join(ENDINGS)}, not {ending}")
+        if not isinstance(options.get("ego"), (str, type(None))):
+            raise _native.InputError("ego is the motion of one pair, and a run has many")
+        if options.get("ground") == "mask":
+            raise _native.InputError("ground='mask' needs masks, which files of sweeps do not have: try 'auto'")
         check(**options)
         self._output, self._ending, self._options = output.rstrip("/") or "/", ending, options
 
@@ -80,6 +84,7 @@ class Labeller:
         """Labels one pair, unless its label is there. A pair that cannot be labelled is refused, not raised."""
         report: dict[str, Any] = dict.fromkeys(COLUMNS, "")
         report |= {"key": key, "source": source, "target": target, "seconds": 0.0, "points": 0, "moving": 0}
+        refused: list[str] = []
         if not KEY.fullmatch(key) or any(part in (".", "..") for part in key.split("/")):
             return report | {"outcome": "refused", "error": f"the key {key[:200]!r} is no name below the output"}
         began = time.monotonic()
@@ -97,6 +102,8 @@ class Labeller:
                 if apart is not None and apart < 0.0:
                     # The flow leads back in time: so do the times of the points.
                     times = (-first.times, -second.times)
+            sweeps = ((source, first), (target, second))
+            refused += [f"{uri}: {sweep.refused_times}" for uri, sweep in sweeps if sweep.refused_times]
             options = self._options
             if options.get("dt_s") is None and apart is not None:
                 options = options | {"dt_s": abs(apart)}
@@ -105,12 +112,13 @@ class Labeller:
         except _native.DeviceError:
             raise
         except REFUSED as error:
-            return report | {"outcome": "refused", "error": str(error)}
+            return report | {"outcome": "refused", "error": str(error), "warnings": "; ".join(refused)}
         return report | {
             "outcome": "labelled" if written else "raced",
             "seconds": time.monotonic() - began,
             "points": len(found),
             "moving": 0 if found.clusters is None else int(found.clusters["dynamic"].sum()),
+            "warnings": "; ".join(refused + found.warnings),
         }
 
 

@@ -21,7 +21,7 @@ from typing import Any, Literal, TypeVar
 import grpc
 import numpy.typing as npt
 
-from . import _arrays, _protocol
+from . import _arrays, _options, _protocol
 from ._arrays import Mask, Matrix, Points
 from ._dense import DenseCloud
 from ._flow import Flow, Progress
@@ -115,9 +115,10 @@ class NamedSweep:
     points: Any
     """N x 3, metres."""
     name: str = ""
-    """Comes back with the flows. Timestamps in names give the time between sweeps."""
+    """Comes back with the flows of `sequence`. Timestamps in names give the time between sweeps, and numbers in names
+    must not turn back."""
     ground: Any = None
-    """N flags: ground points."""
+    """N flags: ground points. Presets that keep the ground use them with `ground="mask"` alone."""
     pose: Any = None
     """4 x 4 world_from_sensor. All sweeps have one, or none."""
 
@@ -163,6 +164,16 @@ def _job(message: Any) -> Job:
         ahead=wait.ahead if wait and wait.HasField("ahead") else None,
         starts_in=wait.seconds if wait else None,
     )
+
+
+def _limit(deadline: float | None, options: dict[str, Any]) -> float | None:
+    """Puts the deadline of a call into its options. Returns the time limit of the call, which is later."""
+    if deadline is None:
+        return None
+    if "deadline_ms" in options:
+        raise TypeError("give deadline or deadline_ms, not both")
+    options["deadline_ms"] = max(1, round(1000.0 * deadline))
+    return deadline + LATE
 
 
 def _refusal(error: grpc.RpcError) -> ServerError:
@@ -263,11 +274,8 @@ class Client:
         masks: list[Mask | None] = [None, None]
         if isinstance(ground, tuple):
             masks = [_arrays.mask(f"the ground mask of pc{place}", mask) for place, mask in enumerate(ground, 1)]
-            ground = None
-        if deadline is not None:
-            if "deadline_ms" in options:
-                raise TypeError("give deadline or deadline_ms, not both")
-            options["deadline_ms"] = max(1, round(1000.0 * deadline))
+            ground = _options.of_masks(options.get("preset"))
+        limit = _limit(deadline, options)
         message = _protocol.options_message({"ground": ground, **options})
         request = _protocol.MESSAGES["EstimateFlowRequest"]
         begin = _protocol.nested("EstimateFlowRequest", "Begin")
@@ -281,7 +289,6 @@ class Client:
 
         header: Any = None
         pieces: list[Any] = []
-        limit = None if deadline is None else deadline + LATE
         for answer in self._stream("EstimateFlow", requests(), limit):
             part = answer.WhichOneof("part")
             if part == "progress" and progress:
@@ -296,8 +303,10 @@ class Client:
         """Yields the flow of each two consecutive sweeps, as soon as it is there.
 
         `sweeps` yields arrays, N x 3 metres, or `NamedSweep`. It is read from another thread, no faster than the server
-        takes them.
+        takes them. With `deadline`, seconds, the best flows reached in time come back. Pairs that were not begun have
+        an error.
         """
+        limit = _limit(deadline, options)
         message = _protocol.options_message(options)
         request = _protocol.MESSAGES["EstimateSequenceRequest"]
         begin = _protocol.nested("EstimateSequenceRequest", "Begin")
@@ -316,7 +325,7 @@ class Client:
         pair: Any = None
         pieces: list[Any] = []
         rows = 0
-        for answer in self._stream("EstimateSequence", requests(), deadline):
+        for answer in self._stream("EstimateSequence", requests(), limit):
             if answer.WhichOneof("part") == "pair":
                 pair, pieces, rows = answer.pair, [], 0
             else:
@@ -364,8 +373,8 @@ class Client:
                 if isinstance(one, str):
                     yield request(next=following(uri=one))
                     continue
-                points, mask, pose, _ = one
-                yield request(next=following(pose=pose))
+                points, mask, pose, name = one
+                yield request(next=following(pose=pose, name=name))
                 for chunk in _protocol.chunks(points, mask):
                     yield request(chunk=chunk)
 
