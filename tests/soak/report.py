@@ -9,7 +9,7 @@ from typing import Any
 from health import LIMIT_MS, percentile
 from plots import Panel, Series, figure
 from state import read
-from trends import MIB, Line, lines
+from trends import MIB, OF_A_JOB, Line, lines
 
 # Colors of the vertical marks in the plots.
 MARKS = {"kills": "red", "database kills": "purple", "restarts": "green", "pauses": "gray"}
@@ -104,7 +104,7 @@ def _health(totals: dict[str, Any], counts: dict[str, int]) -> str:
 def _growth(found: list[Line]) -> str:
     if not found:
         return "Nothing is judged: no life and no run was long enough."
-    scale = {"rss": (MIB, "MiB"), "blobs": (MIB, "MiB"), "queue": (MIB, "MiB"), "disk": (MIB, "MiB")}
+    scale = {name: (MIB, "MiB") for name in ("rss", "queue", "orphan_bytes")} | dict.fromkeys(OF_A_JOB, (1024, "KiB"))
     rows = []
     for line in found:
         unit, name = scale.get(line.name, (1, ""))

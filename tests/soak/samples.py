@@ -98,7 +98,6 @@ def of_store(data: Path, database: Postgres | None) -> dict[str, Any] | None:
     else:
         found["queue"] = (data / "queue.sqlite3").stat().st_size
         found["wal"] = size_of(data / "queue.sqlite3-wal")
-    found["disk"] = found["blobs"] + found["orphan_bytes"] + found["queue"]
     return found
 
 

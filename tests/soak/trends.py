@@ -31,10 +31,12 @@ TOLERANCES: dict[str, tuple[float, float]] = {
     "threads": (0.1, 4),
     "series": (0.0, 0.5),
     "rows": (0.25, 200),
-    "blobs": (0.25, 8 * MIB),
     "queue": (0.25, 2 * MIB),
-    "disk": (0.25, 10 * MIB),
+    "blobs of a job": (0.25, 4096),
+    "orphan_bytes": (0.25, 10 * MIB),
 }
+# The number of jobs kept follows the speed of the machine: these are divided by it.
+OF_A_JOB = {"blobs of a job": "blobs"}
 
 
 @dataclass
@@ -82,7 +84,7 @@ def lines(folder: Path) -> list[Line]:
     settled = _steady([one for one in processes if COMMON_AGE[0] < one["age"] < COMMON_AGE[1]], 60.0)
     scope, at, steady = "whole run", lambda one: one["s"], _steady(store, STORE_WARM_UP)
     found += _lines(scope, settled, ("rss", "descriptors", "threads", "series"), at, SHORTEST_RUN)
-    found += _lines(scope, steady, ("rows", "blobs", "queue", "disk"), at, SHORTEST_RUN)
+    found += _lines(scope, steady, ("rows", "queue", "orphan_bytes", *OF_A_JOB), at, SHORTEST_RUN)
     return found
 
 
@@ -117,12 +119,19 @@ def _lines(
 ) -> list[Line]:
     found = []
     for name in names:
-        held = [(at(sample), float(sample[name])) for sample in samples if name in sample]
+        held = [(at(sample), value) for sample in samples if (value := _value(sample, name)) is not None]
         if len(held) > 5 and held[-1][0] - held[0][0] >= least:
             seconds = held[-1][0] - held[0][0]
             slack = 2.0 if seconds < (LONG_RUN if scope == "whole run" else LONG_LIFE) else 1.0
             found.append(fit(name, scope, [one for one, _ in held], [value for _, value in held], slack))
     return found
+
+
+def _value(sample: dict[str, Any], name: str) -> float | None:
+    """A quantity of a sample; `None` where it was not measured."""
+    if name not in OF_A_JOB:
+        return sample.get(name)
+    return sample[OF_A_JOB[name]] / sample["rows"] if sample.get("rows") else None
 
 
 def judge(state: State) -> None:
