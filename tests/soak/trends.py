@@ -37,6 +37,7 @@ TOLERANCES: dict[str, tuple[float, float]] = {
 }
 # The number of jobs kept follows the speed of the machine: these are divided by it.
 OF_A_JOB = {"blobs of a job": "blobs"}
+OF_A_PROCESS = ("rss", "descriptors", "threads", "series")
 
 
 @dataclass
@@ -79,11 +80,11 @@ def lines(folder: Path) -> list[Line]:
         warm = [sample for sample in stretch if sample["age"] > LIFE_WARM_UP]
         if warm and warm[-1]["age"] - warm[0]["age"] >= SHORTEST_LIFE:
             scope = f"life {warm[0]['life']} ({warm[0]['node']}) from {warm[0]['age']:.0f} s"
-            found += _lines(scope, warm, ("rss", "descriptors", "threads", "series"), lambda one: one["age"])
+            found += _lines(scope, warm, OF_A_PROCESS, lambda one: one["age"])
     # Processes of one age, so that the lengths of their lives do not matter.
-    settled = _steady([one for one in processes if COMMON_AGE[0] < one["age"] < COMMON_AGE[1]], 60.0)
+    settled = _one_a_life(_steady([one for one in processes if COMMON_AGE[0] < one["age"] < COMMON_AGE[1]], 60.0))
     scope, at, steady = "whole run", lambda one: one["s"], _steady(store, STORE_WARM_UP)
-    found += _lines(scope, settled, ("rss", "descriptors", "threads", "series"), at, SHORTEST_RUN)
+    found += _lines(scope, settled, OF_A_PROCESS, at, SHORTEST_RUN)
     found += _lines(scope, steady, ("rows", "queue", "orphan_bytes", *OF_A_JOB), at, SHORTEST_RUN)
     return found
 
@@ -100,6 +101,18 @@ def _stretches(processes: list[dict[str, Any]], trouble: list[dict[str, Any]]) -
         if not before or sample["s"] - before[-1] > SHOCK_SECONDS:
             found[sample["life"], len(before)].append(sample)
     return list(found.values())
+
+
+def _one_a_life(samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The mean sample of each life. Samples of one life depend on each other, so they show no scatter."""
+    lives: dict[tuple[int, str, int], list[dict[str, Any]]] = defaultdict(list)
+    for sample in samples:
+        lives[sample["piece"], sample["node"], sample["life"]].append(sample)
+    means = []
+    for life in lives.values():
+        held = {name: [one[name] for one in life if name in one] for name in ("s", *OF_A_PROCESS)}
+        means.append({name: sum(values) / len(values) for name, values in held.items() if values})
+    return means
 
 
 def _steady(samples: list[dict[str, Any]], warm_up: float) -> list[dict[str, Any]]:
