@@ -2,9 +2,9 @@
 
 use fnsf::flow::RigidTransform;
 use fnsf::formats::{
-    GroundRaster, PoseFile, SweepTime, compare_names, is_dense, is_tracks, pair_interval_s,
-    read_camera, read_camera0_from_lidar, read_depth_png, read_flow, read_motion, read_poses,
-    read_tracks, turning_sweep, write_depth_png, write_tracks,
+    GroundRaster, INTERVAL_S, PoseFile, SweepTime, compare_names, is_dense, is_tracks,
+    pair_interval_s, read_camera, read_camera0_from_lidar, read_depth_png, read_flow, read_motion,
+    read_poses, read_tracks, turning_sweep, write_depth_png, write_tracks,
 };
 use libfuzzer_sys::Corpus;
 
@@ -111,7 +111,7 @@ pub(crate) fn names(bytes: &[u8]) -> Corpus {
             }
             let interval = pair_interval_s([one, other], [None, None]);
             if let Some(seconds) = interval {
-                assert!(seconds.abs() > 0.0 && seconds.abs() <= 60.0);
+                assert!((INTERVAL_S[0]..=INTERVAL_S[1]).contains(&seconds.abs()));
             }
             let reversed = pair_interval_s([other, one], [None, None]);
             assert_eq!(interval, reversed.map(|seconds| -seconds));

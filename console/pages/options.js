@@ -52,7 +52,7 @@ export function optionsForm(presets) {
   const priority = select(PRIORITIES, "normal", () => {});
   const points = number({ min: "3", step: "1", placeholder: "all", data: { test: "max-points" } });
   const crop = number({ min: "0", step: "any", placeholder: "none" });
-  const interval = number({ min: "0", step: "any", placeholder: "file names, else 0.1" });
+  const interval = number({ min: "0.001", max: "60", step: "any", placeholder: "file names, else 0.1" });
   const deadline = number({ min: "1", step: "1", placeholder: "none" });
   const seed = number({ min: "0", max: Number.MAX_SAFE_INTEGER, step: "1", placeholder: "0", data: { test: "seed" } });
   const labels = el("input", { type: "text", placeholder: "drive=7, split=val", data: { test: "labels" } });

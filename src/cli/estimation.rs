@@ -12,9 +12,7 @@ use super::output::complain;
 use super::{device, files};
 use crate::flow::field::{Backend, BackendError};
 use crate::flow::{self, Control, Estimate, FlowError, Point, RigidTransform, Sequence, Sweep};
-use crate::formats::{
-    self, PointTimes, SweepClock, SweepOrder, TimedCloud, pair_interval_s, sweep_time_s,
-};
+use crate::formats::{self, SweepClock, SweepOrder, TimedCloud, pair_interval_s, sweep_time_s};
 use crate::job::{
     DeviceChoice, EgoChoice, FieldChoices, GroundChoice, JobOptions, PrecisionChoice, PresetChoice,
 };
@@ -67,7 +65,7 @@ pub(super) struct Estimation {
     /// that are not metres. Without overlap the confidence is 0
     #[arg(long)]
     force: bool,
-    /// Seconds from one sweep to the next, above 0 and at most 60; the velocities of objects are
+    /// Seconds from one sweep to the next, 0.001 to 60; the velocities of objects are
     /// displacements over this time. By default the difference of the file names where they are
     /// timestamps, else 0.1
     #[arg(long, value_name = "SECONDS")]
@@ -333,12 +331,12 @@ impl Surroundings {
         let TimedCloud {
             cloud,
             times,
+            clock,
             refused_times,
         } = files::read_timed_cloud(path)?;
         if let Some(refused) = refused_times {
             complain(format_args!("warning: {}: {refused}", path.display()));
         }
-        let clock = times.as_ref().map(PointTimes::clock);
         let known = index.checked_sub(self.forgotten);
         if let Some(sweep) = known.and_then(|index| self.known.get_mut(index)) {
             sweep.clock = clock;

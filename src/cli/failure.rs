@@ -4,6 +4,7 @@ use std::fmt;
 use std::process::ExitCode;
 
 use crate::flow::FlowError;
+use crate::formats::FormatError;
 use crate::text::printable;
 
 /// A failed command.
@@ -44,6 +45,16 @@ impl Failure {
         Self {
             kind: Kind::Internal,
             error: error.into(),
+        }
+    }
+
+    /// A file cannot be written. Values that no reader takes come of the input.
+    pub(super) fn of_writing(error: anyhow::Error) -> Self {
+        match error.downcast_ref() {
+            Some(FormatError::NotFinite { .. } | FormatError::OutOfRange { .. }) => {
+                Self::bad_input(error)
+            }
+            _ => Self::internal(error),
         }
     }
 

@@ -338,9 +338,8 @@ pub(super) fn write<E: std::error::Error + Send + Sync + 'static>(
         writer(&mut output.file)?;
         output.complete()
     };
-    written()
-        .with_context(|| format!("cannot write {}", path.display()))
-        .map_err(Failure::internal)
+    let written = written().with_context(|| format!("cannot write {}", path.display()));
+    written.map_err(Failure::of_writing)
 }
 
 /// Writes a file below `folder` under a name that is not the user's own. Makes its folders. A link of this

@@ -113,6 +113,11 @@ impl Tracking<'_> {
         Ok(())
     }
 
+    /// Whether a pair was taken.
+    pub(super) fn has_pairs(&self) -> bool {
+        self.last.is_some()
+    }
+
     /// Writes the tracks and their picture. Prints what was written, unless `quiet`.
     pub(super) fn finish(self, quiet: bool) -> Result<(), Failure> {
         let tracks = self.tracker.finish();

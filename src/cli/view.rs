@@ -261,19 +261,23 @@ fn local(
 
 fn npz(table: &FlowTable<'_>) -> Result<Bytes, Failure> {
     let mut bytes = Vec::new();
-    write_flow(FlowFormat::Npz, table, &mut bytes).map_err(Failure::internal)?;
+    let written = write_flow(FlowFormat::Npz, table, &mut bytes);
+    written.map_err(|error| Failure::of_writing(error.into()))?;
     Ok(bytes.into())
 }
 
 /// A flow file of another format as npz.
 fn encoded(file: FlowFile, points: &[Point]) -> Result<Bytes, Failure> {
-    let columns = (file.cluster, file.confidence, file.moving, file.clusters);
-    let objects = match columns {
-        (Some(cluster), Some(confidence), Some(moving), Some(clusters)) => Some(Objects {
-            cluster,
+    let objects = match (file.cluster, file.confidence, file.moving) {
+        (Some(cluster), Some(confidence), Some(moving)) => Some(Objects {
+            // The numbers of clusters that the file does not describe mean nothing.
+            cluster: match file.clusters {
+                Some(_) => cluster,
+                None => vec![-1; points.len()],
+            },
             confidence,
             moving,
-            clusters,
+            clusters: file.clusters.unwrap_or_default(),
         }),
         _ => None,
     };

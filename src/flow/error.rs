@@ -100,12 +100,13 @@ impl FlowError {
     /// True for sweeps of two scenes, coordinates that are not metres, too few points, a missing
     /// ground mask or one of the wrong length, times of the wrong length, an empty target,
     /// clouds that span too much space, a pair that exceeds the allowed memory or the memory of the
-    /// device, and an option that the device does not support. False for all other errors,
-    /// including an invalid cell or band of the distance transform.
+    /// device, an option that the device does not support, and a fit that diverges: its seed is fixed,
+    /// so that it diverges again. False for all other errors, including an invalid cell or band of the
+    /// distance transform.
     pub fn is_input(&self) -> bool {
         match self {
             Self::NoOverlap { .. } | Self::TooFewPoints { .. } => true,
-            Self::NotMetres { .. } => true,
+            Self::NotMetres { .. } | Self::Diverged { .. } => true,
             Self::NoGroundMask | Self::GroundMaskLength { .. } | Self::TimesLength { .. } => true,
             Self::Backend(BackendError::Distance(error)) => !matches!(
                 error,
@@ -115,7 +116,7 @@ impl FlowError {
             ),
             Self::Backend(BackendError::Unsupported(_) | BackendError::Memory { .. }) => true,
             Self::Backend(BackendError::Linear(LinearError::Memory { .. })) => true,
-            Self::Cancelled | Self::Diverged { .. } | Self::Snapshot(_) | Self::Backend(_) => false,
+            Self::Cancelled | Self::Snapshot(_) | Self::Backend(_) => false,
         }
     }
 }

@@ -14,6 +14,7 @@ use super::ply::Ply;
 use super::point_times::{PointTimes, TimesColumn};
 use super::scalar::{Scalar, write_floats};
 use super::sniff::recognize;
+use super::timestamps::SweepClock;
 use super::{bin, feather, npy, pcd, ply};
 use crate::flow::Point;
 
@@ -36,6 +37,8 @@ pub struct TimedCloud {
     pub cloud: Cloud,
     /// The time of each point. None if the file has none, or the same for all points.
     pub times: Option<PointTimes>,
+    /// The clock of the sweep by its finite times, also where the times are not used.
+    pub clock: Option<SweepClock>,
     /// Why the file's column of times is not used: a time is NaN or infinite, or they are not those of one
     /// sweep.
     pub refused_times: Option<String>,
@@ -103,11 +106,12 @@ pub fn read_cloud_within(
 /// As for [`read_cloud`].
 pub fn read_timed_cloud(bytes: &[u8], name: Option<&str>) -> Result<TimedCloud, FormatError> {
     let (cloud, column) = read(bytes, name, MAX_POINTS, true)?;
-    let (times, refused_times) = TimesColumn::used(column);
+    let read = TimesColumn::used(column);
     Ok(TimedCloud {
         cloud,
-        times,
-        refused_times,
+        times: read.times,
+        clock: read.clock,
+        refused_times: read.refused,
     })
 }
 

@@ -40,6 +40,16 @@ impl PointTimes {
     }
 }
 
+/// What is known of a sweep by its column of point times.
+#[derive(Default)]
+pub(super) struct ReadTimes {
+    pub(super) times: Option<PointTimes>,
+    /// The clock of the sweep by its finite times, also where the times are not used.
+    pub(super) clock: Option<SweepClock>,
+    /// Why they are not used.
+    pub(super) refused: Option<String>,
+}
+
 /// The values of a column of point times, one for each row read so far.
 pub(super) struct TimesColumn {
     name: &'static str,
@@ -82,11 +92,26 @@ impl TimesColumn {
         self.values.push(f64::NAN);
     }
 
-    /// The times of a column that a file may have; or why they are not used.
-    pub(super) fn used(column: Option<Self>) -> (Option<PointTimes>, Option<String>) {
-        match column.map_or(Ok(None), |column| column.times()) {
+    /// What is known by a column that a file may have.
+    pub(super) fn used(column: Option<Self>) -> ReadTimes {
+        let Some(column) = column else {
+            return ReadTimes::default();
+        };
+        let (times, refused) = match column.times() {
             Ok(times) => (times, None),
             Err(refused) => (None, Some(refused)),
+        };
+        let clock = times.as_ref().map(PointTimes::clock);
+        let broken = column.not_finite.map(|row| {
+            format!(
+                "its column {} is NaN or infinite in row {row}: the points count as measured at one instant",
+                column.name
+            )
+        });
+        ReadTimes {
+            times: times.filter(|_| broken.is_none()),
+            clock,
+            refused: broken.or(refused),
         }
     }
 
@@ -96,12 +121,6 @@ impl TimesColumn {
     /// The duration determines the unit. The time of the sweep is the origin of the column if that is
     /// at most two durations away from the points, otherwise the first point's.
     fn times(&self) -> Result<Option<PointTimes>, String> {
-        if let Some(row) = self.not_finite {
-            return Err(format!(
-                "its column {} is NaN or infinite in row {row}: the points count as measured at one instant",
-                self.name
-            ));
-        }
         let finite = || {
             self.values
                 .iter()
@@ -193,12 +212,20 @@ mod tests {
         assert_eq!(times("time", &[f64::NAN, f64::NAN]), Ok(None));
         let refused = times("time", &[0.0, 86_400.0 * 1e12]).expect_err("a day of picoseconds");
         assert!(refused.contains("column time spans 8.640e16"), "{refused}");
+    }
+
+    #[test]
+    fn a_time_that_is_not_finite_costs_the_sweep_its_times_but_not_its_clock() {
         let mut column = TimesColumn::named("time");
-        for time in [0.0, f64::NAN, 0.1] {
+        for time in [7.0, f64::NAN, 7.1] {
             column.push(time);
         }
-        let refused = column.times().expect_err("no time");
+        let read = TimesColumn::used(Some(column));
+        let clock = read.clock.expect("of the finite times");
+        assert!((clock.duration_s - 0.1).abs() < 1e-9 && clock.sweep_s == Some(7.0));
+        let refused = read.refused.expect("a reason");
         assert!(refused.contains("infinite in row 1"), "{refused}");
+        assert_eq!(read.times, None);
     }
 
     #[test]

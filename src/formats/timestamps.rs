@@ -1,7 +1,7 @@
 //! Times of sweeps in their file names, as data sets write them.
 
-/// The longest time between two sweeps of one flow, seconds.
-const MAX_INTERVAL_S: f64 = 60.0;
+/// The shortest and the longest time between two sweeps of one flow, seconds.
+pub const INTERVAL_S: [f32; 2] = [1e-3, 60.0];
 
 /// The time at which a sweep was recorded, by the timestamp in its file name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -44,7 +44,7 @@ pub struct SweepClock {
 }
 
 /// Seconds from the source of a pair to its target, by what is known of them. It is the difference of
-/// the timestamps in their `names`, else of the sensor's clock, else the duration of the source,
+/// the timestamps in their `names`, else of the sensor's clock, else the duration of one of the sweeps,
 /// because a spinning lidar does not pause between two turns. It is below zero where the target was
 /// measured first. None if nothing is known.
 pub fn pair_interval_s(names: [&str; 2], clocks: [Option<SweepClock>; 2]) -> Option<f32> {
@@ -53,16 +53,17 @@ pub fn pair_interval_s(names: [&str; 2], clocks: [Option<SweepClock>; 2]) -> Opt
     by_names
         .and_then(|(source, target)| source.interval_s(target))
         .or_else(|| {
-            let [source, target] = clocks;
-            let (source, target) = source.zip(target)?;
-            let apart = source.sweep_s.zip(target.sweep_s);
-            let apart = apart.map(|(source, target)| target - source);
-            let is_interval =
-                |seconds: &f64| seconds.abs() > 0.0 && seconds.abs() <= MAX_INTERVAL_S;
-            let apart = apart.filter(is_interval);
-            let seconds = apart.unwrap_or(source.duration_s);
-            is_interval(&seconds).then_some(seconds as f32)
+            let [source, target] = clocks.map(|clock| clock?.sweep_s);
+            let apart = source.zip(target).map(|(source, target)| target - source);
+            let apart = apart.filter(|seconds| is_interval(seconds.abs()));
+            let seconds = apart.or_else(|| Some(clocks[0].or(clocks[1])?.duration_s))?;
+            is_interval(seconds.abs()).then_some(seconds as f32)
         })
+}
+
+/// Whether a time is that between two sweeps of one flow.
+fn is_interval(seconds: f64) -> bool {
+    (INTERVAL_S[0]..=INTERVAL_S[1]).contains(&(seconds as f32))
 }
 
 /// Time of a sweep, seconds: that in its `name`, else that of its sensor's clock. None if neither is
@@ -76,9 +77,9 @@ impl SweepTime {
     /// The time in a file name or path; none if it holds no timestamp.
     ///
     /// A timestamp is a run of digits between the last path separator and the first dot of the file
-    /// name. 18 or 19 digits are nanoseconds, 16 microseconds, 13 milliseconds. The last of several
-    /// timestamps is used. Ten digits, a dot and nine digits are seconds and nanoseconds, as ROS
-    /// writes them.
+    /// name. 18 or 19 digits are nanoseconds. 16 are microseconds and 13 milliseconds, unless they
+    /// begin with a zero, as a counter does. The last of several timestamps is used. Ten digits, a dot
+    /// and nine digits are seconds and nanoseconds, as ROS writes them.
     pub fn from_name(name: &str) -> Option<Self> {
         let file = name.rsplit(['/', '\\']).next()?;
         let mut parts = file.split('.');
@@ -98,8 +99,8 @@ impl SweepTime {
         let mut found = runs.filter_map(|digits| {
             let unit = match digits.len() {
                 18 | 19 => TimeUnit::Nanoseconds,
-                16 => TimeUnit::Microseconds,
-                13 => TimeUnit::Milliseconds,
+                16 if !digits.starts_with('0') => TimeUnit::Microseconds,
+                13 if !digits.starts_with('0') => TimeUnit::Milliseconds,
                 _ => return None,
             };
             let ticks = digits.parse().ok()?;
@@ -119,13 +120,12 @@ impl SweepTime {
     }
 
     /// Seconds from this sweep to another, below zero where the other is the earlier one. None if the
-    /// units differ, the times are the same, or they are more than 60 s apart.
+    /// units differ, or the times are less than 1 ms or more than 60 s apart.
     pub fn interval_s(self, other: Self) -> Option<f32> {
         let ticks = self.ticks.abs_diff(other.ticks) as f64;
         let seconds = ticks * self.unit.nanoseconds() as f64 * 1e-9;
-        let is_interval = self.unit == other.unit && seconds > 0.0 && seconds <= MAX_INTERVAL_S;
         let sign = if other.ticks < self.ticks { -1.0 } else { 1.0 };
-        is_interval.then_some(sign * seconds as f32)
+        (self.unit == other.unit && is_interval(seconds)).then_some(sign * seconds as f32)
     }
 }
 
@@ -154,6 +154,9 @@ mod tests {
             ),
             ("1617179420.1.pcd", "1617179420.2.pcd", None),
             ("0000000011.pcd", "0000000012.pcd", None),
+            ("0000000000011.pcd", "0000000000012.pcd", None),
+            ("1700000000200.ply", "1700000000201.ply", Some(0.001)),
+            ("1700000000000000000.ply", "1700000000000000100.ply", None),
             ("1700000000200.ply", "1700000000200.ply", None),
             ("1700000000200.ply", "1800000000200.ply", None),
             ("1700000000200.ply", "315966265259836000.ply", None),

@@ -4,11 +4,10 @@ use std::time::Duration;
 
 use crate::flow::MIN_POINTS;
 use crate::flow::densify::PlanError;
+use crate::formats::INTERVAL_S;
 
 /// The longest allowed deadline.
 pub(super) const MAX_DEADLINE: Duration = Duration::from_secs(24 * 60 * 60);
-/// The longest allowed time between two sweeps, seconds.
-pub const MAX_DT_S: f32 = 60.0;
 
 /// Why options are refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -58,8 +57,12 @@ pub enum InvalidOptions {
     /// The least range is not a positive, finite number of metres.
     #[error("options: min_range_m is {0}, a positive number of metres is needed")]
     MinRange(f32),
-    /// The time between two sweeps, seconds, is not a number above 0 and at most 60.
-    #[error("options: dt_s is {0}, more than 0 and at most {MAX_DT_S} seconds are possible")]
+    /// The time between two sweeps, seconds, is not within [`INTERVAL_S`].
+    #[error(
+        "options: dt_s is {0}, {least} to {most} seconds are possible",
+        least = INTERVAL_S[0],
+        most = INTERVAL_S[1]
+    )]
     Dt(f32),
     /// There are more labels than possible; with their number.
     #[error("options: {0} labels are too many, 16 are possible")]

@@ -20,7 +20,7 @@ pub use choices::{EgoChoice, GroundChoice, PrecisionChoice, PresetChoice, Priori
 pub use delivery::{Delivery, DeliveryState, PAIR_INDEX, uri_of_pair};
 pub use densify::{Densify, LaterSweepsChoice};
 pub use device::{DeviceChoice, DeviceKind};
-pub use error::{InvalidOptions, MAX_DT_S};
+pub use error::InvalidOptions;
 pub use field::FieldChoices;
 pub use id::{InvalidId, JobId, Tenant};
 pub use labels::Labels;

@@ -9,10 +9,11 @@ use utoipa::ToSchema;
 use super::choices::{EgoChoice, GroundChoice, PrecisionChoice, PresetChoice, Priority};
 use super::densify::Densify;
 use super::device::{DeviceChoice, DeviceKind};
-use super::error::{InvalidOptions, MAX_DEADLINE, MAX_DT_S};
+use super::error::{InvalidOptions, MAX_DEADLINE};
 use super::field::FieldChoices;
 use super::labels::Labels;
 use crate::flow::{self, Ego, FieldOptions, Ground, MIN_POINTS, Precision};
+use crate::formats::INTERVAL_S;
 
 /// Options of a pair or of a sequence.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
@@ -44,7 +45,7 @@ pub struct JobOptions {
     /// than 0. It leaves out the vehicle's own returns. None are left out if not given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub min_range_m: Option<f32>,
-    /// Time between consecutive sweeps, seconds, for velocities: more than 0, at most 60. If not
+    /// Time between consecutive sweeps, seconds, for velocities: 0.001 to 60. If not
     /// given, it is taken from the timestamps in the file names, or is 0.1 without them.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub dt_s: Option<f32>,
@@ -163,7 +164,7 @@ impl JobOptions {
             return Err(InvalidOptions::MinRange(least));
         }
         if let Some(dt) = self.dt_s
-            && !(dt > 0.0 && dt <= MAX_DT_S)
+            && !(INTERVAL_S[0]..=INTERVAL_S[1]).contains(&dt)
         {
             return Err(InvalidOptions::Dt(dt));
         }
@@ -337,7 +338,11 @@ mod tests {
             (r#"{"max_points":2}"#, "max_points is 2"),
             (r#"{"crop_m":-1}"#, "crop_m is -1"),
             (r#"{"min_range_m":0}"#, "min_range_m is 0"),
-            (r#"{"dt_s":0}"#, "dt_s is 0"),
+            (
+                r#"{"dt_s":0}"#,
+                "dt_s is 0, 0.001 to 60 seconds are possible",
+            ),
+            (r#"{"dt_s":60.5}"#, "dt_s is 60.5"),
             (r#"{"deadline_ms":0}"#, "deadline_ms is 0"),
             (r#"{"ego":"yes"}"#, "ego is \"off\", \"auto\""),
             (

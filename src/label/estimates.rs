@@ -6,6 +6,7 @@ use std::sync::mpsc::{Receiver, Sender, SyncSender};
 
 use super::io::{At, Io, Loaded, Output, Unread, Wanted, isolated, mark_text};
 use super::layout::{left_out_path, tracks_path};
+use super::places::path_of;
 use super::report::{Outcome, RowReport};
 use super::types::Solver;
 use crate::flow::tracks::{Tracker, push_and_correct};
@@ -13,8 +14,7 @@ use crate::flow::{
     Control, Estimate, FlowError, Method, Options, Point, Problem, Sweep, WindowedPair,
     neighbor_cost, predict_cost, window,
 };
-use crate::formats::{SweepClock, pair_interval_s, read_av2_mask, write_tracks};
-use crate::job::MAX_DT_S;
+use crate::formats::{INTERVAL_S, SweepClock, pair_interval_s, read_av2_mask, write_tracks};
 
 /// Upper bounds of the memory of an object search: bytes of any, and bytes for each point of both sweeps.
 const MIN_BYTES: usize = 64 << 20;
@@ -272,10 +272,11 @@ impl Estimates<'_> {
         let sweeps = &self.io.inputs.plan.drives()[wanted.drive].sweeps[wanted.pair..];
         let times = sweeps[0].time_s.zip(sweeps[1].time_s);
         let apart = times.map(|(source, target)| (target - source) as f32);
-        let names = [&sweeps[0].uri, &sweeps[1].uri].map(String::as_str);
+        let names = [&sweeps[0].uri, &sweeps[1].uri].map(|uri| path_of(uri));
+        let [least, most] = INTERVAL_S;
         apart
-            .filter(|apart| apart.abs() > 0.0 && apart.abs() <= MAX_DT_S)
-            .or_else(|| pair_interval_s(names, clocks))
+            .filter(|apart| (least..=most).contains(&apart.abs()))
+            .or_else(|| pair_interval_s(names.each_ref().map(String::as_str), clocks))
     }
 
     fn put(
@@ -329,8 +330,7 @@ impl Estimates<'_> {
     }
 }
 
-/// What became of a pair whose estimate failed. A fit that diverges does so again: its seed is fixed.
+/// What became of a pair whose estimate failed.
 fn failed(error: &FlowError) -> (Outcome, String) {
-    let lasts = error.is_input() || matches!(error, FlowError::Diverged { .. });
-    (Outcome::of_trouble(!lasts), error.to_string())
+    (Outcome::of_trouble(!error.is_input()), error.to_string())
 }

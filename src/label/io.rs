@@ -10,11 +10,11 @@ use bytes::Bytes;
 use tokio::runtime::Runtime;
 
 use super::layout::left_out_path;
-use super::places::{PlaceError, Places};
+use super::places::{PlaceError, Places, path_of};
 use super::report::{Outcome, RowReport};
 use super::types::Inputs;
 use crate::flow::{Point, Sweep};
-use crate::formats::{FormatError, PointTimes, SweepClock, read_timed_cloud, sweep_time_s};
+use crate::formats::{FormatError, SweepClock, read_timed_cloud, sweep_time_s};
 
 /// Begins a mark while its label is replaced, so that another run does not take the mark for its own.
 const UNFINISHED: &str = "replaced:\n";
@@ -113,18 +113,19 @@ impl Io<'_> {
             may_pass: error.may_pass() || matches!(error, PlaceError::Bucket(_)),
             reason: error.to_string(),
         })?;
-        let name = uri.rsplit('/').next();
+        let path = path_of(uri);
+        let name = path.rsplit('/').next();
         let read = isolated("its reader", || read_timed_cloud(&bytes, name));
         let read = read.and_then(|read| read.map_err(|error| error.to_string()));
         let read = read.map_err(|reason| Unread {
             may_pass: false,
             reason: format!("{uri}: {reason}"),
         })?;
-        let clock = read.times.as_ref().map(PointTimes::clock);
+        let clock = read.clock;
         let sweep = Sweep {
             points: read.cloud.points,
             ground: None,
-            time_s: time_s.or_else(|| sweep_time_s(uri, clock)),
+            time_s: time_s.or_else(|| sweep_time_s(&path, clock)),
             times: read
                 .times
                 .filter(|_| !self.inputs.ignore_times)

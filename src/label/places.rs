@@ -90,6 +90,11 @@ fn parts(uri: &str) -> Result<(Option<String>, String), PlaceError> {
     Ok((Some(root), path.map_or("", |(_, path)| path).to_owned()))
 }
 
+/// The path of a URI, decoded as its store reads it.
+pub(super) fn path_of(uri: &str) -> String {
+    parts(uri).map_or_else(|_| uri.to_owned(), |(_, path)| path)
+}
+
 impl Places {
     fn bucket(&self, root: &str) -> Result<Objects, PlaceError> {
         let mut open = locked(&self.0);
@@ -298,10 +303,7 @@ fn folder_entries(folder: &Path) -> io::Result<[Vec<String>; 2]> {
     };
     for entry in listed {
         let entry = entry?;
-        let name = entry.file_name().into_string().map_err(|name| {
-            let message = format!("the name {} is no UTF-8", name.display());
-            io::Error::new(ErrorKind::InvalidFilename, message)
-        })?;
+        let name = entry.file_name().to_string_lossy().into_owned();
         let mut kind = entry.file_type()?;
         if kind.is_symlink() {
             match fs::metadata(entry.path()) {
@@ -313,9 +315,14 @@ fn folder_entries(folder: &Path) -> io::Result<[Vec<String>; 2]> {
                 }
             }
         }
-        match kind.is_dir() {
-            true => folders.push(name),
-            false => files.push(name),
+        match (kind.is_dir(), entry.file_name().to_str()) {
+            (true, Some(_)) => folders.push(name),
+            (true, None) => {
+                let message = format!("the name {name} is no UTF-8");
+                return Err(io::Error::new(ErrorKind::InvalidFilename, message));
+            }
+            // A sweep whose name is no UTF-8 is refused later, as a file that is not there.
+            (false, _) => files.push(name),
         }
     }
     folders.sort();
@@ -339,6 +346,7 @@ mod tests {
         ] {
             assert_eq!(taken(uri).expect(uri), expected);
         }
+        assert_eq!(path_of("file:///a/b%201.pcd"), "/a/b 1.pcd");
         for uri in ["ftp://a/b", "s3:///x", "://"] {
             assert!(matches!(parts(uri), Err(PlaceError::Uri(_))), "{uri}");
         }

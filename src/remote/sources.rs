@@ -7,6 +7,7 @@ use std::sync::Arc;
 use bytes::Bytes;
 use futures_util::stream::{self, BoxStream};
 use futures_util::{StreamExt, TryStreamExt};
+use percent_encoding::percent_decode_str;
 use tokio::io::AsyncReadExt;
 use url::Url;
 
@@ -135,8 +136,9 @@ impl Sources {
             _ => parts.read_object(&url).await?,
         };
         let name = url.path_segments().and_then(Iterator::last);
+        let name = percent_decode_str(name.unwrap_or_default()).decode_utf8_lossy();
         Ok(Download {
-            name: name.unwrap_or_default().to_owned(),
+            name: name.into_owned(),
             blake3,
             pieces,
         })

@@ -294,6 +294,9 @@ impl Worker {
                 self.metrics.aligned(*overlap);
                 Attempt::failed("no_overlap", error, false)
             }
+            EngineError::Flow(FlowError::Diverged { .. }) => {
+                Attempt::failed("diverged", error, false)
+            }
             EngineError::Flow(flow) if flow.is_input() => {
                 Attempt::failed("input_refused", error, false)
             }
@@ -305,15 +308,9 @@ impl Worker {
                 tracing::warn!(%error, "the job is given back");
                 Attempt::Ended(Outcome::Crashed(failure("device_lost", error, true)))
             }
-            EngineError::Flow(flow) => {
+            EngineError::Flow(_) => {
                 tracing::error!(%error, "an attempt failed");
-                let diverged = matches!(flow, FlowError::Diverged { .. });
-                let code = if diverged {
-                    "diverged"
-                } else {
-                    "device_failed"
-                };
-                Attempt::failed(code, error, true)
+                Attempt::failed("device_failed", error, true)
             }
             EngineError::Panicked(_) => {
                 tracing::error!(%error, "an attempt failed");

@@ -1,6 +1,8 @@
 //! Tests of bulk labelling with names, links and files that cannot work.
 
+use std::ffi::OsStr;
 use std::fs;
+use std::os::unix::ffi::OsStrExt;
 use std::process::Command;
 use std::sync::atomic::AtomicBool;
 
@@ -225,6 +227,21 @@ fn times_that_are_not_used_are_told_with_each_label() {
     let table = fs::read_to_string(folder.join("labels/_report.csv")).expect("written");
     let told = "sweep_0001.pcd: its column time is NaN or infinite in row 5";
     assert_eq!(table.matches(told).count(), 2, "{table}");
+}
+
+#[test]
+fn a_name_that_is_no_text_costs_its_own_pair_alone() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    drives(folder, 1, "3");
+    for name in [b"notes \xff.txt", b"sweep \xff.pcd"] {
+        let name = OsStr::from_bytes(name);
+        fs::write(folder.join("drives/d0").join(name), "").expect("written");
+    }
+    let done = label(folder, &["drives", "-o", "labels"]);
+    assert_eq!(done.code, 65, "{}", done.stderr);
+    assert!(done.stdout.contains("1 are refused"), "{}", done.stdout);
+    assert_eq!(labels(&folder.join("labels")).len(), 2);
 }
 
 #[test]

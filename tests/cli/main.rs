@@ -8,6 +8,7 @@
 mod commands;
 #[path = "../common/dense_file.rs"]
 mod dense_file;
+mod deskew;
 mod evaluation;
 mod export;
 mod follow;

@@ -207,7 +207,7 @@ fn a_given_flow_is_shown_as_it_is_and_one_of_other_sweeps_is_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     street(folder.path(), "3");
     let [a, b, c] = [0, 1, 2].map(|at| format!("street/sweep_000{at}.pcd"));
-    for flow in ["flow.npz", "flow.ply"] {
+    for flow in ["flow.npz", "flow.ply", "flow.feather"] {
         let ended = fnsf(folder.path(), &["flow", &a, &b, "-o", flow]);
         assert_eq!(ended.code, 0, "{}", ended.stderr);
         let view = View::start(folder.path(), &[&a, &b, "--flow", flow]);
@@ -216,6 +216,8 @@ fn a_given_flow_is_shown_as_it_is_and_one_of_other_sweeps_is_refused() {
         let given = std::fs::read(folder.path().join(flow)).expect("a file");
         let given = read_flow(&given, None).expect("a flow");
         assert_eq!(shown.flow, given.flow, "{flow}");
+        assert_eq!(shown.confidence, given.confidence, "{flow}");
+        assert!(shown.moving.is_some(), "{flow}");
     }
     let too_few = fnsf(folder.path(), &["view", &a, &b, &c, "--flow", "flow.npz"]);
     assert_eq!(too_few.code, 2);

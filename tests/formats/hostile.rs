@@ -84,6 +84,7 @@ fn a_column_with_a_time_that_is_not_finite_is_left_out_and_named() {
     write_timed_pcd(&points, &[0.0, f32::NAN, 0.1], &mut bytes).unwrap();
     let read = read_timed_cloud(&bytes, None).unwrap();
     assert_eq!((read.cloud.points, read.times), (points, None));
+    assert!((read.clock.unwrap().duration_s - 0.1).abs() < 1e-6);
     let refused = read.refused_times.unwrap();
     assert!(
         refused.contains("column time is NaN or infinite in row 1"),

@@ -53,6 +53,17 @@ async fn sweeps_of_two_scenes_are_refused_by_their_own_code_and_forced_ones_are_
 }
 
 #[tokio::test]
+async fn a_fit_that_diverges_is_tried_once() {
+    let server = Server::start(&[]);
+    let options = r#"{"preset":"nsfp-baseline","max_points":512,"field":{"learning_rate":1e30,"max_iterations":20}}"#;
+    let refused = posted(&server, small_pair(), options).await;
+    assert_eq!(refused.status(), StatusCode::UNPROCESSABLE_ENTITY);
+    let problem: Value = refused.json().await.expect("a problem");
+    assert_eq!(problem["job_error"]["code"], "diverged", "{problem}");
+    assert_eq!(problem["job_error"]["retryable"], false, "{problem}");
+}
+
+#[tokio::test]
 async fn coordinates_in_millimetres_are_refused_before_they_are_queued() {
     let server = Server::start(&[]);
     let scaled = |points: &Vec<Point>| points.iter().map(|p| p.map(|c| c * 1000.0)).collect();

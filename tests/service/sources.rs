@@ -50,7 +50,7 @@ async fn refuse(server: &Server, source: &str, code: &str) {
 
 #[tokio::test]
 async fn sweeps_by_uri_give_the_flow_of_the_same_files_that_are_sent() {
-    let (_folder, prefix) = folder();
+    let (folder, prefix) = folder();
     let server = Server::with_config(&config(&prefix, false));
     let [a, b] = ["a.npy", "b.npy"].map(|name| format!("{prefix}{name}"));
     let hash = blake3::hash(&file(CloudFormat::Npy, &small_pair()[0]));
@@ -68,6 +68,18 @@ async fn sweeps_by_uri_give_the_flow_of_the_same_files_that_are_sent() {
         .await
         .expect("a flow");
     assert_eq!(named, sent);
+    // A URI has %20 for the space, whose digits would join those of the timestamp.
+    let names = ["LIDAR 1532402927647951", "LIDAR 1532402927697731"];
+    for (name, points) in names.iter().zip(small_pair()) {
+        let path = folder.path().join(format!("{name}.npy"));
+        std::fs::write(path, file(CloudFormat::Npy, points)).expect("a file");
+    }
+    let [first, second] = names.map(|name| format!("{prefix}{name}.npy").replace(' ', "%20"));
+    let (status, body) = send(&server, "/v1/jobs", &first, &second).await;
+    assert_eq!(status, StatusCode::ACCEPTED);
+    let job: Value = serde_json::from_slice(&body).expect("JSON");
+    let job = ended(&server, job["id"].as_str().expect("an id")).await;
+    assert_eq!(job["report"]["dt_s"], 0.04978, "{job}");
     // A sequence of both kinds.
     let form = Form::new()
         .text("sweep_uri", a.clone())

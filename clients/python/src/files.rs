@@ -31,8 +31,8 @@ pub(crate) fn read_sweep<'py>(
     let times = read.times.as_ref();
     let offsets = times.map(|times| from_values(py, &times.offsets_s));
     answer.set_item("times", offsets)?;
-    answer.set_item("time", times.and_then(|times| times.sweep_s))?;
-    answer.set_item("duration", times.map(|times| times.duration_s))?;
+    answer.set_item("time", read.clock.and_then(|clock| clock.sweep_s))?;
+    answer.set_item("duration", read.clock.map(|clock| clock.duration_s))?;
     answer.set_item("refused_times", &read.refused_times)?;
     Ok(answer)
 }

@@ -39,29 +39,31 @@ impl Flow {
         let surroundings = self.estimation.surroundings(&self.sweeps)?;
         self.check_deskew(&surroundings, &options)?;
         let mut pairs = Pairs::new(self, options, surroundings, tracking, count - 1)?;
-        match given {
+        let done = match given {
             Some(pair) => {
                 let (source, target) = match pair.ground {
                     Some(ground) => (Some(ground.source), Some(ground.target)),
                     None => (None, None),
                 };
-                for (points, ground) in [(pair.source, source), (pair.target, target)] {
+                let mut given = [(pair.source, source), (pair.target, target)].into_iter();
+                given.try_for_each(|(points, ground)| {
                     let sweep = Sweep {
                         points,
                         ground,
                         ..Sweep::default()
                     };
-                    pairs.push(&Arc::new(sweep), Taken::default())?;
-                }
+                    pairs.push(&Arc::new(sweep), Taken::default())
+                })
             }
-            None => {
-                for path in &self.sweeps {
-                    let (sweep, taken) = pairs.read(path)?;
-                    pairs.push(&Arc::new(sweep), taken)?;
-                }
-            }
-        }
-        pairs.finish()
+            None => self.sweeps.iter().try_for_each(|path| {
+                let (sweep, taken) = match pairs.read(path) {
+                    Ok(read) => read,
+                    Err(failure) => return pairs.flush().and(Err(failure)),
+                };
+                pairs.push(&Arc::new(sweep), taken)
+            }),
+        };
+        pairs.finish(done)
     }
 
     /// Estimates the pairs of a folder's sweeps as they are written.

@@ -96,7 +96,7 @@ impl<'a> Pairs<'a> {
         }
         if self.flow.deskew == DeskewChoice::On && sweep.times.is_none() {
             let path = path.display();
-            return Err(Failure::usage(anyhow!(
+            return Err(Failure::bad_input(anyhow!(
                 "{path}: its points have no times, which --deskew on needs"
             )));
         }
@@ -194,12 +194,16 @@ impl<'a> Pairs<'a> {
         }
     }
 
-    /// Ends the sequence.
-    pub(super) fn finish(mut self) -> Result<(), Failure> {
-        self.flush()?;
-        let json = self.flow.json;
-        self.tracking
-            .map_or(Ok(()), |tracking| tracking.finish(json))
+    /// Ends the sequence. `done` says how its pairs ended so far. The tracks before a pair that is refused
+    /// are written.
+    pub(super) fn finish(mut self, done: Result<(), Failure>) -> Result<(), Failure> {
+        let done = done.and_then(|()| self.flush());
+        let tracking = self.tracking.filter(Tracking::has_pairs);
+        match (&done, tracking) {
+            (Err(failure), _) if !failure.is_of_input() => done,
+            (_, Some(tracking)) => done.and(tracking.finish(self.flow.json)),
+            (_, None) => done,
+        }
     }
 
     /// Begins a new sequence with the next sweep.
@@ -248,8 +252,13 @@ impl<'a> Pairs<'a> {
                 names: &waiting.names,
                 arrived: waiting.target.arrived,
             };
-            let latency_s = put(self.flow, &complete)?;
-            self.latencies_s.extend(latency_s);
+            match put(self.flow, &complete) {
+                Ok(latency_s) => self.latencies_s.extend(latency_s),
+                Err(failure) => {
+                    self.waiting.push_front(waiting);
+                    return Err(failure);
+                }
+            }
             self.writing_s = self.terminal.seconds() - began;
         }
         Ok(())

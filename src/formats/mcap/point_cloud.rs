@@ -166,12 +166,12 @@ impl<'a> PointCloud<'a> {
                 }
             }
         }
-        let (times, refused_times) = TimesColumn::used(column);
+        let read = TimesColumn::used(column);
         Ok(RecordedSweep {
             stamp_ns: self.stamp_ns,
             points,
-            times,
-            refused_times,
+            times: read.times,
+            refused_times: read.refused,
             dropped,
         })
     }

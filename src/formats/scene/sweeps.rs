@@ -131,12 +131,12 @@ impl Scene {
             }
             column = Some(times);
         }
-        let (times, refused_times) = TimesColumn::used(column);
+        let read = TimesColumn::used(column);
         Ok(SceneSweep {
             points,
             ground,
-            times,
-            refused_times,
+            times: read.times,
+            refused_times: read.refused,
         })
     }
 }
