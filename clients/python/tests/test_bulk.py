@@ -61,6 +61,17 @@ def test_what_is_suspicious_about_a_pair_is_in_its_report(table, street, tmp_pat
     assert told == [1, 1, 0]
 
 
+def test_names_in_a_uri_are_decoded_before_their_timestamps_are_read(table, tmp_path):
+    for index, stamp in enumerate(["1532402927647951", "1532402927697731"]):
+        os.rename(tmp_path / f"{index}.pcd", tmp_path / f"LIDAR {stamp}.pcd")
+    uris = [f"file://{tmp_path}/LIDAR%20{stamp}.pcd" for stamp in ["1532402927647951", "1532402927697731"]]
+    for key, options in [("found", {}), ("told", {"dt_s": 0.04978})]:
+        report = Labeller(str(tmp_path), **options).label(key, *uris)
+        assert report["outcome"] == "labelled", report
+    found, told = (fnsf.read_flow(tmp_path / f"{key}.npz").clusters for key in ["found", "told"])
+    assert np.array_equal(found, told) and np.abs(found["velocity"]).max() > 1
+
+
 def test_a_pair_whose_fit_diverges_is_refused(table, tmp_path):
     labeller = Labeller(
         str(tmp_path / "labels"), preset="nsfp-baseline", field={"learning_rate": 1e30, "max_iterations": 20}

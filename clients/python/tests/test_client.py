@@ -37,6 +37,19 @@ def test_the_flow_of_a_server_has_the_bits_of_the_library(server, pair):
     assert not theirs.valid[pair.masks[0]].any() and theirs.valid[~pair.masks[0]].all()
 
 
+def test_what_the_library_refuses_does_not_reach_a_server(server, pair):
+    broken = pair.masks[0].astype(float)
+    broken[7] = np.nan
+    with server.client() as client:
+        for masks in [([], pair.masks[1]), (pair.masks[0][:-1], pair.masks[1]), (broken, pair.masks[1])]:
+            with pytest.raises(fnsf.InputError, match="ground mask of pc1"):
+                client.flow(pair.source, pair.target, ground=masks)
+        with pytest.raises(fnsf.InputError, match="deadline is 0"):
+            client.flow(pair.source, pair.target, deadline=0)
+        with pytest.raises(fnsf.InputError, match="sweep 1 has 2 rows"):
+            client.submit([pair.source, NamedSweep(pair.target, ground=[True, False])])
+
+
 def test_refusals_have_the_code_of_the_server(server, pair):
     with server.client(api_key="another key, of no tenant") as client, pytest.raises(ServerError) as refused:
         client.flow(pair.source, pair.target)

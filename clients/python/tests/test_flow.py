@@ -85,6 +85,15 @@ def test_masks_times_and_ego_motions_are_taken(street, pair):
     # The preset of the paper keeps the ground, but not that of masks.
     cut = fnsf.flow(pair.source, pair.target, preset="paper", ground=pair.masks, field={"max_iterations": 5})
     assert not cut.valid[pair.masks[0]].any() and cut.valid[~pair.masks[0]].all()
+    unknown = np.zeros(len(pair.source))
+    unknown[3] = np.nan
+    for wrong, said in [
+        (unknown, "nan in row 3"),
+        (np.arange(len(pair.source)) * 1000, "seconds after the sweep"),
+        (np.full(len(pair.source), 1.6e9), "seconds after the sweep"),
+    ]:
+        with pytest.raises(fnsf.InputError, match=said):
+            fnsf.flow(pair.source, pair.target, times=(wrong, np.zeros(len(pair.target))))
     timed = np.zeros(len(pair.source)), np.zeros(len(pair.target))
     assert fnsf.flow(pair.source, pair.target, times=timed).valid.all()
 

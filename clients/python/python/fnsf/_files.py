@@ -32,7 +32,7 @@ class Sweep:
     time: float | None = None
     """The sweep's time on the sensor's clock, seconds, where the file has it."""
     duration: float | None = None
-    """Seconds from the first point to the last, where points have times."""
+    """Seconds from the first point to the last, where the file has times."""
     refused_times: str | None = None
     """Why the file's column of times is not used, in words."""
 

@@ -178,13 +178,15 @@ def flow(
         DeviceError: the device is missing, has too little memory, or failed.
         KeyboardInterrupt: Ctrl-C ends the estimate within a fraction of a second.
     """
+    source, target = _arrays.points("pc1", pc1), _arrays.points("pc2", pc2)
     masks = None
     if isinstance(ground, tuple):
         first, second = ground
         masks = (_arrays.mask("the ground mask of pc1", first), _arrays.mask("the ground mask of pc2", second))
         ground = _options.of_masks(preset)
     if times is not None:
-        times = (_arrays.values("the times of pc1", times[0]), _arrays.values("the times of pc2", times[1]))
+        first, second = times
+        times = (_arrays.times("the times of pc1", first, source), _arrays.times("the times of pc2", second, target))
     options = _options.as_json(
         {
             "preset": preset,
@@ -201,8 +203,8 @@ def flow(
         },
     )
     answer = _native.estimate(
-        _arrays.points("pc1", pc1),
-        _arrays.points("pc2", pc2),
+        source,
+        target,
         options,
         masks=masks,
         times=times,

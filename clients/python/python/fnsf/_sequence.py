@@ -64,10 +64,11 @@ class Sequence:
                 again, with other arguments. All flows before the pair have been returned. To go on, begin another
                 sequence with the sweeps after the pair.
         """
+        sweep = _arrays.points("points", points)
         answers = self._native.push(
-            _arrays.points("points", points),
+            sweep,
             mask=None if ground is None else _arrays.mask("the ground mask", ground),
-            times=None if times is None else _arrays.values("times", times),
+            times=None if times is None else _arrays.times("times", times, sweep),
             ego=None if ego is None else _arrays.matrix("ego", ego),
             dt_s=dt_s,
             deadline=deadline,

@@ -94,8 +94,8 @@ class Labeller:
             path = f"{root.rstrip('/')}/{key}.{self._ending}"
             if _exists(filesystem, path):
                 return report | {"outcome": "found"}
-            first, second = _sweep(source), _sweep(target)
-            apart = _native.pair_interval((source, target), (_clock(first), _clock(second)))
+            (first, name), (second, other) = _sweep(source), _sweep(target)
+            apart = _native.pair_interval((name, other), (_clock(first), _clock(second)))
             times = None
             if first.times is not None and second.times is not None:
                 times = (first.times, second.times)
@@ -145,7 +145,8 @@ def _exists(filesystem: Any, path: str) -> bool:
     return bool(filesystem.get_file_info(path).type == fs.FileType.File)
 
 
-def _sweep(uri: str) -> Sweep:
+def _sweep(uri: str) -> tuple[Sweep, str]:
+    """The sweep of a path or URI, and its path: in a URI the name of the file may be encoded."""
     from pyarrow import fs
 
     filesystem, path = _filesystem(uri)
@@ -156,11 +157,11 @@ def _sweep(uri: str) -> Sweep:
     if about.type != fs.FileType.File or about.size > MAX_FILE:
         raise _native.InputError(f"{uri} is no file of at most {MAX_FILE} bytes")
     with filesystem.open_input_file(path) as file:
-        return Sweep(**_native.read_sweep(file.read(about.size), uri))
+        return Sweep(**_native.read_sweep(file.read(about.size), path)), path
 
 
 def _clock(sweep: Sweep) -> tuple[float, float | None] | None:
-    """The duration of a sweep and its time, seconds; none where its points have no times."""
+    """The duration of a sweep and its time, seconds; none where its file has no times."""
     return None if sweep.duration is None else (sweep.duration, sweep.time)
 
 

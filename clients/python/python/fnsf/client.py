@@ -21,7 +21,7 @@ from typing import Any, Literal, TypeVar
 import grpc
 import numpy.typing as npt
 
-from . import _arrays, _options, _protocol
+from . import _arrays, _native, _options, _protocol
 from ._arrays import Mask, Matrix, Points
 from ._dense import DenseCloud
 from ._flow import Flow, Progress
@@ -172,6 +172,8 @@ def _limit(deadline: float | None, options: dict[str, Any]) -> float | None:
         return None
     if "deadline_ms" in options:
         raise TypeError("give deadline or deadline_ms, not both")
+    if not 0.0 < deadline < float("inf"):
+        raise _native.InputError(f"deadline is {deadline}: a positive number of seconds is needed")
     options["deadline_ms"] = max(1, round(1000.0 * deadline))
     return deadline + LATE
 
@@ -273,7 +275,10 @@ class Client:
         source, target = _arrays.points("pc1", pc1), _arrays.points("pc2", pc2)
         masks: list[Mask | None] = [None, None]
         if isinstance(ground, tuple):
-            masks = [_arrays.mask(f"the ground mask of pc{place}", mask) for place, mask in enumerate(ground, 1)]
+            masks = [
+                _arrays.mask(f"the ground mask of pc{place}", mask, len(cloud))
+                for place, (mask, cloud) in enumerate(zip(ground, (source, target), strict=True), 1)
+            ]
             ground = _options.of_masks(options.get("preset"))
         limit = _limit(deadline, options)
         message = _protocol.options_message({"ground": ground, **options})
@@ -462,7 +467,8 @@ def _sweep(index: int, sweep: Any) -> tuple[Points, Mask | None, list[float], st
     """The points, mask, pose and name of a sweep."""
     known = sweep if isinstance(sweep, NamedSweep) else NamedSweep(sweep)
     points = _arrays.points(f"sweep {index}", known.points)
-    mask = None if known.ground is None else _arrays.mask(f"the ground mask of sweep {index}", known.ground)
+    given = known.ground
+    mask = None if given is None else _arrays.mask(f"the ground mask of sweep {index}", given, len(points))
     pose: list[float] = []
     if known.pose is not None:
         matrix: Matrix = _arrays.matrix(f"the pose of sweep {index}", known.pose)

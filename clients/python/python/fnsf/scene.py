@@ -1,7 +1,7 @@
 """Scenes of OpenSceneFlow: the flows of `fnsf label` in the HDF5 file that they were estimated from.
 
     fnsf unpack scene.h5 -o drives
-    fnsf label drives -o labels --preset default
+    fnsf label drives -o labels --preset default --ignore-times
     python -m fnsf.scene scene.h5 labels/scene --name fnsf
 
 Each group of the file then has an array of this name beside `lidar`, which OpenSceneFlow's own scripts take for their
