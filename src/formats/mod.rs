@@ -67,5 +67,7 @@ pub use crate::formats::scene::{Scene, SceneSweep};
 pub use crate::formats::semantic_kitti::moving_labels;
 pub use crate::formats::sniff::recognize;
 pub use sweep_order::{SweepOrder, compare_names, turning_sweep};
-pub use timestamps::{INTERVAL_S, SweepClock, SweepTime, TimeUnit, pair_interval_s, sweep_time_s};
+pub use timestamps::{
+    INTERVAL_S, SweepClock, SweepTime, TimeUnit, is_interval, pair_interval_s, sweep_time_s,
+};
 pub use tracks::{is_tracks, read_tracks, write_tracks};

@@ -61,8 +61,8 @@ pub fn pair_interval_s(names: [&str; 2], clocks: [Option<SweepClock>; 2]) -> Opt
         })
 }
 
-/// Whether a time is that between two sweeps of one flow.
-fn is_interval(seconds: f64) -> bool {
+/// Whether a time is within [`INTERVAL_S`].
+pub fn is_interval(seconds: f64) -> bool {
     (INTERVAL_S[0]..=INTERVAL_S[1]).contains(&(seconds as f32))
 }
 

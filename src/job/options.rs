@@ -13,7 +13,7 @@ use super::error::{InvalidOptions, MAX_DEADLINE};
 use super::field::FieldChoices;
 use super::labels::Labels;
 use crate::flow::{self, Ego, FieldOptions, Ground, MIN_POINTS, Precision};
-use crate::formats::INTERVAL_S;
+use crate::formats::is_interval;
 
 /// Options of a pair or of a sequence.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
@@ -164,7 +164,7 @@ impl JobOptions {
             return Err(InvalidOptions::MinRange(least));
         }
         if let Some(dt) = self.dt_s
-            && !(INTERVAL_S[0]..=INTERVAL_S[1]).contains(&dt)
+            && !is_interval(dt.into())
         {
             return Err(InvalidOptions::Dt(dt));
         }

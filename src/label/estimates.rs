@@ -14,7 +14,7 @@ use crate::flow::{
     Control, Estimate, FlowError, Method, Options, Point, Problem, Sweep, WindowedPair,
     neighbor_cost, predict_cost, window,
 };
-use crate::formats::{INTERVAL_S, SweepClock, pair_interval_s, read_av2_mask, write_tracks};
+use crate::formats::{SweepClock, is_interval, pair_interval_s, read_av2_mask, write_tracks};
 
 /// Upper bounds of the memory of an object search: bytes of any, and bytes for each point of both sweeps.
 const MIN_BYTES: usize = 64 << 20;
@@ -271,11 +271,11 @@ impl Estimates<'_> {
     fn interval_s(&self, wanted: &Wanted, clocks: [Option<SweepClock>; 2]) -> Option<f32> {
         let sweeps = &self.io.inputs.plan.drives()[wanted.drive].sweeps[wanted.pair..];
         let times = sweeps[0].time_s.zip(sweeps[1].time_s);
-        let apart = times.map(|(source, target)| (target - source) as f32);
+        let apart = times.map(|(source, target)| target - source);
         let names = [&sweeps[0].uri, &sweeps[1].uri].map(|uri| path_of(uri));
-        let [least, most] = INTERVAL_S;
         apart
-            .filter(|apart| (least..=most).contains(&apart.abs()))
+            .filter(|apart| is_interval(apart.abs()))
+            .map(|apart| apart as f32)
             .or_else(|| pair_interval_s(names.each_ref().map(String::as_str), clocks))
     }
 
