@@ -133,7 +133,7 @@ pub fn predict_cost(problem: &Problem, options: &Options) -> Result<Cost, FlowEr
         }
     };
     let registered = selection.registration_clouds.iter().flatten();
-    let registered: usize = registered.map(Vec::len).sum();
+    let registered: usize = registered.map(|cloud| cloud.len()).sum();
     let registration = match selection.registration_clouds {
         Some(_) => ALIGNING + registered as f64 * THINNING,
         None => 0.0,

@@ -12,7 +12,7 @@ use super::problem::{NeighborSweep, Problem};
 
 /// The selected points of a pair.
 #[derive(Clone, Debug)]
-pub(crate) struct Selection {
+pub(crate) struct Selection<'a> {
     /// Source row of each point of `source`.
     pub(crate) rows: Vec<usize>,
     /// Target row of each point of `target`.
@@ -27,7 +27,7 @@ pub(crate) struct Selection {
     /// Source and target clouds for the registration, where the ego motion is estimated: all points
     /// that are finite and within the crop. Ground is included, because it determines pitch, roll
     /// and height.
-    pub(crate) registration_clouds: Option<[Vec<Point>; 2]>,
+    pub(crate) registration_clouds: Option<[Cow<'a, [Point]>; 2]>,
     /// All points of the two clouds that `source` and `target` were sampled from; none where they
     /// were not sampled.
     pub(crate) undrawn: Option<[Vec<Point>; 2]>,
@@ -44,19 +44,19 @@ pub(crate) fn find_ground(sweeps: &[&[Point]]) -> Vec<Vec<bool>> {
     sweeps.iter().map(|points| ground::mask(points)).collect()
 }
 
-/// Selects the points of `problem` by `options`. `given` are the source and the target as they were
+/// Selects the points of `problem` by `options`, the two clouds in parallel. `given` are the source and the target as they were
 /// measured, before any deskewing: a point is within the crop and far enough from the sensor where both
 /// of its positions are.
 ///
 /// # Errors
 /// [`FlowError`] where coordinates are not metres, a mask is missing or has another length, or fewer
 /// than [`MIN_POINTS`] points of a cloud remain.
-pub(crate) fn select(
-    problem: &Problem,
+pub(crate) fn select<'a>(
+    problem: &Problem<'a>,
     given: [&[Point]; 2],
     options: &Options,
     find: FindGround<'_>,
-) -> Result<Selection, FlowError> {
+) -> Result<Selection<'a>, FlowError> {
     check_metres("source", problem.source, options)?;
     check_metres("target", problem.target, options)?;
     let known = problem.ground.map_or([None; 2], |masks| masks.map(Some));
@@ -71,10 +71,9 @@ pub(crate) fn select(
     let has_ground = masks.iter().any(Option::is_none);
     let ego_only_rows = match &masks {
         [Some(ground), _] if options.ground == Ground::Auto && options.max_points.is_none() => {
-            let rows = 0..ground.len();
-            let positions = |row: usize| [problem.source[row], given[0][row]];
-            rows.filter(|&row| ground[row] && are_in_crop(positions(row), options))
-                .collect()
+            let is_in_crop = rows_in_crop([problem.source, given[0]], options);
+            let rows = (0..ground.len()).filter(|&row| ground[row] && is_in_crop(row));
+            rows.collect()
         }
         _ => Vec::new(),
     };
@@ -112,11 +111,18 @@ pub(crate) fn select(
             });
         }
     }
+    let chosen = |rows: &[usize], points: &'a [Point]| {
+        let registered = (options.ego == Ego::Auto).then(|| cropped(points, options));
+        (points_at(rows, points), registered)
+    };
+    let ((source, registered), (target, registered_target)) = rayon::join(
+        || chosen(&rows, problem.source),
+        || chosen(&target_rows, problem.target),
+    );
     Ok(Selection {
-        source: points_at(&rows, problem.source),
-        target: points_at(&target_rows, problem.target),
-        registration_clouds: (options.ego == Ego::Auto)
-            .then(|| [problem.source, problem.target].map(|points| cropped(points, options))),
+        source,
+        target,
+        registration_clouds: registered.zip(registered_target).map(<[_; 2]>::from),
         undrawn,
         has_ground,
         rows,
@@ -202,20 +208,23 @@ pub(crate) fn ground_masks<'a, const SWEEPS: usize>(
         Ground::Mask | Ground::Auto => {}
     }
     let unmasked = sweeps.iter().filter(|(_, mask)| mask.is_none());
-    let clouds: Vec<Vec<Point>> = unmasked
+    let clouds: Vec<Cow<'_, [Point]>> = unmasked
         .map(|(points, _)| cropped(points, options))
         .collect();
-    let clouds: Vec<&[Point]> = clouds.iter().map(Vec::as_slice).collect();
     let found = if clouds.is_empty() {
         Vec::new()
     } else {
-        find(&clouds)
+        find(&clouds.iter().map(|cloud| &cloud[..]).collect::<Vec<_>>())
     };
     let mut found = found.into_iter();
     Ok(sweeps.map(|(points, mask)| {
         Some(mask.map_or_else(
             || {
-                let mut found = found.next().unwrap_or_default().into_iter();
+                let found = found.next().unwrap_or_default();
+                if found.len() == points.len() {
+                    return Cow::Owned(found);
+                }
+                let mut found = found.into_iter();
                 let is_ground =
                     |&point: &Point| is_in_crop(point, options) && found.next() == Some(true);
                 Cow::Owned(points.iter().map(is_ground).collect())
@@ -226,9 +235,12 @@ pub(crate) fn ground_masks<'a, const SWEEPS: usize>(
 }
 
 /// All points that are finite and within the crop.
-pub(crate) fn cropped(points: &[Point], options: &Options) -> Vec<Point> {
-    let kept = points.iter().filter(|&&point| is_in_crop(point, options));
-    kept.copied().collect()
+pub(crate) fn cropped<'a>(points: &'a [Point], options: &Options) -> Cow<'a, [Point]> {
+    let is_kept = |&&point: &&Point| is_in_crop(point, options);
+    if points.iter().all(|point| is_kept(&point)) {
+        return Cow::Borrowed(points);
+    }
+    Cow::Owned(points.iter().filter(is_kept).copied().collect())
 }
 
 /// Whether a point is finite, within the crop and not too near.
@@ -239,11 +251,13 @@ pub(crate) fn is_in_crop([x, y, z]: Point, options: &Options) -> bool {
     finite && x.abs() <= crop && y.abs() <= crop && is_far
 }
 
-/// Whether all positions of a point are within the crop, see [`is_in_crop`].
-fn are_in_crop(positions: [Point; 2], options: &Options) -> bool {
-    positions
-        .iter()
-        .all(|&position| is_in_crop(position, options))
+/// Whether the point of a row is within the crop where it is and where it was `given`, see
+/// [`is_in_crop`].
+fn rows_in_crop([points, given]: [&[Point]; 2], options: &Options) -> impl Fn(usize) -> bool {
+    let is_moved = !std::ptr::eq(points, given);
+    move |row| {
+        is_in_crop(points[row], options) && (!is_moved || is_in_crop(given[row], options))
+    }
 }
 
 fn rows_of_pair(
@@ -252,20 +266,17 @@ fn rows_of_pair(
     [source, target]: &[Option<Cow<'_, [bool]>>; 2],
     options: &Options,
 ) -> Result<[Vec<usize>; 2], FlowError> {
-    Ok([
-        selected_rows(
-            "source",
-            [problem.source, given[0]],
-            source.as_deref(),
-            options,
-        )?,
-        selected_rows(
-            "target",
-            [problem.target, given[1]],
-            target.as_deref(),
-            options,
-        )?,
-    ])
+    let (source, target) = rayon::join(
+        || {
+            let points = [problem.source, given[0]];
+            selected_rows("source", points, source.as_deref(), options)
+        },
+        || {
+            let points = [problem.target, given[1]];
+            selected_rows("target", points, target.as_deref(), options)
+        },
+    );
+    Ok([source?, target?])
 }
 
 /// Rows of `points` that are finite, within the crop and not masked. `given` are the points as they
@@ -285,9 +296,11 @@ fn selected_rows(
             points: points.len(),
         });
     }
-    Ok((0..points.len())
-        .filter(|&row| are_in_crop([points[row], given[row]], options))
-        .filter(|&row| !mask.is_some_and(|mask| mask[row]))
+    let is_in_crop = rows_in_crop([points, given], options);
+    let is_masked = |row: usize| mask.is_some_and(|mask| mask[row]);
+    let rows = 0..points.len();
+    Ok(rows
+        .filter(|&row| !is_masked(row) && is_in_crop(row))
         .collect())
 }
 

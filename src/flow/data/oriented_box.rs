@@ -101,22 +101,68 @@ impl Rectangle {
     }
 }
 
+/// The points that may be corners of the convex hull: without those inside the octagon of the
+/// outermost points along both axes and both diagonals (Akl and Toussaint 1978).
+fn outer(points: Vec<[f64; 2]>) -> Vec<[f64; 2]> {
+    /// Points of which a sort costs less than this.
+    const FEW: usize = 64;
+    /// Share of the extent by which a point lies inside: far above the rounding of a cross product.
+    const INSIDE: f64 = 1e-9;
+    if points.len() <= FEW {
+        return points;
+    }
+    let directions: [[f64; 2]; 8] = [
+        [1.0, 0.0],
+        [1.0, 1.0],
+        [0.0, 1.0],
+        [-1.0, 1.0],
+        [-1.0, 0.0],
+        [-1.0, -1.0],
+        [0.0, -1.0],
+        [1.0, -1.0],
+    ];
+    let mut corners = [points[0]; 8];
+    let mut farthest = [f64::NEG_INFINITY; 8];
+    for &point in &points {
+        for (axis, [x, y]) in directions.into_iter().enumerate() {
+            let along = x * point[0] + y * point[1];
+            if along > farthest[axis] {
+                (farthest[axis], corners[axis]) = (along, point);
+            }
+        }
+    }
+    let edges: [[[f64; 2]; 2]; 8] = core::array::from_fn(|i| [corners[i], corners[(i + 1) % 8]]);
+    let extent = (farthest[0] + farthest[4]).max(farthest[2] + farthest[6]);
+    if extent == 0.0 {
+        return points;
+    }
+    let margin = INSIDE * extent * extent;
+    let is_outer = |&point: &[f64; 2]| {
+        let is_beyond = |&[a, b]: &[[f64; 2]; 2]| a != b && cross(a, b, point) <= margin;
+        edges.iter().any(is_beyond)
+    };
+    points.into_iter().filter(is_outer).collect()
+}
+
+/// Twice the area of a triangle, positive if it is counterclockwise.
+fn cross(a: [f64; 2], b: [f64; 2], c: [f64; 2]) -> f64 {
+    (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+}
+
 /// The corners of the convex hull, counterclockwise (Andrew 1979). Fewer than three distinct points
 /// are returned as they are.
-fn hull(mut points: Vec<[f64; 2]>) -> Vec<[f64; 2]> {
+fn hull(points: Vec<[f64; 2]>) -> Vec<[f64; 2]> {
+    let mut points = outer(points);
     points.sort_unstable_by(|a, b| a[0].total_cmp(&b[0]).then(a[1].total_cmp(&b[1])));
     points.dedup();
     if points.len() < 3 {
         return points;
     }
-    let left = |a: [f64; 2], b: [f64; 2], c: [f64; 2]| {
-        (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) > 0.0
-    };
     let chain = |points: &mut dyn Iterator<Item = [f64; 2]>| {
         let mut chain: Vec<[f64; 2]> = Vec::new();
         for point in points {
             while let [.., a, b] = chain[..]
-                && !left(a, b, point)
+                && cross(a, b, point) <= 0.0
             {
                 chain.pop();
             }
@@ -199,10 +245,32 @@ mod tests {
     fn few_points_and_points_on_a_line_have_boxes_too() {
         let one = OrientedBox::enclosing(&[[1.0, 2.0, 3.0]], None);
         assert_eq!((one.center, one.size), ([1.0, 2.0, 3.0], [0.0; 3]));
-        let line: Vec<Point> = (0..5).map(|i| [i as f32, i as f32, 0.0]).collect();
-        let line = OrientedBox::enclosing(&line, None);
-        assert!(close(line.size[0], 4.0 * 2.0_f32.sqrt(), 1e-5), "{line:?}");
-        assert!(close(line.size[1], 0.0, 1e-5), "{line:?}");
-        assert!(close(line.yaw, PI / 4.0, 1e-5), "{line:?}");
+        for count in [5, 500] {
+            let same = OrientedBox::enclosing(&vec![[1.0, 2.0, 3.0]; count], None);
+            assert_eq!(same, one);
+            let along = |i: usize| i as f32 * 4.0 / (count - 1) as f32;
+            let line: Vec<Point> = (0..count).map(|i| [along(i), along(i), 0.0]).collect();
+            let line = OrientedBox::enclosing(&line, None);
+            assert!(close(line.size[0], 4.0 * 2.0_f32.sqrt(), 1e-5), "{line:?}");
+            assert!(close(line.size[1], 0.0, 1e-5), "{line:?}");
+            assert!(close(line.yaw, PI / 4.0, 1e-5), "{line:?}");
+        }
+    }
+
+    #[test]
+    fn points_within_the_octagon_are_no_corners_and_no_corner_is_left_out() {
+        let mut random = Random::new(8);
+        for count in [3, 65, 400, 5000] {
+            let mut coordinate = || random.uniform(-50.0, 50.0);
+            let points: Vec<[f64; 2]> = (0..count).map(|_| [coordinate(), coordinate()]).collect();
+            let corners = hull(points.clone());
+            // A corner is one that a line parts from all other points: the edges show it.
+            for (i, &a) in corners.iter().enumerate() {
+                let b = corners[(i + 1) % corners.len()];
+                assert!(points.iter().all(|&point| cross(a, b, point) >= 0.0));
+            }
+            let left = outer(points).len();
+            assert!(left >= corners.len() && (count < 400 || left < count / 2));
+        }
     }
 }

@@ -17,7 +17,11 @@ const SECONDS_PER_POINT: f64 = 2e-6;
 /// Whether the remaining time allows a registration of all points of the selection.
 pub(super) fn has_time_for_all(selection: &Selection, control: &dyn Control) -> bool {
     let clouds = selection.registration_clouds.iter().flatten();
-    let points: usize = clouds.map(Vec::len).sum();
+    has_time_for(clouds.map(|cloud| cloud.len()).sum(), control)
+}
+
+/// Whether the remaining time allows a registration of `points` points.
+pub(super) fn has_time_for(points: usize, control: &dyn Control) -> bool {
     let ample = SECONDS_PER_POINT * points as f64;
     control.seconds_left().is_none_or(|left| left > ample)
 }

@@ -21,7 +21,7 @@ pub(super) struct Input<'a> {
     /// Whether the pair of `problem` is deskewed. If not, it is `given`.
     pub(super) is_deskewed: bool,
     pub(super) options: &'a Options,
-    pub(super) selection: &'a Selection,
+    pub(super) selection: &'a Selection<'a>,
     pub(super) control: &'a dyn Control,
 }
 

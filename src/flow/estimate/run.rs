@@ -8,6 +8,7 @@ use super::by_cluster;
 use super::by_field;
 use super::by_objects;
 use super::deskewing::{deskew, has_deskew};
+use super::ego_motion::has_time_for;
 use super::method::{Alignment, Input, Solved};
 use super::result::{Estimate, Solution};
 use crate::flow::data::{Control, DYNAMIC_M, Point, StopReason, transform_point};
@@ -87,8 +88,16 @@ fn estimate_from(
         }
     }
     let (problem, options) = (&problem, options.as_ref());
-    let find_ground = |sweeps: &[&[Point]]| backend.host().ground(sweeps);
-    let selection = select(problem, given, options, &find_ground)?;
+    let host = backend.host();
+    let find_ground = |sweeps: &[&[Point]]| {
+        let points = sweeps.iter().map(|sweep| sweep.len()).sum();
+        if options.ego == Ego::Auto && has_time_for(points, control) {
+            host.ground_and_surfels(sweeps)
+        } else {
+            host.ground(sweeps)
+        }
+    };
+    let selection = host.install(|| select(problem, given, options, &find_ground))?;
     let selected_at = control.seconds();
     let input = Input {
         problem,

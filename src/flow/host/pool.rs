@@ -127,18 +127,18 @@ impl Host {
         self.threads.install(|| found.collect())
     }
 
-    /// [`Self::ground`], while the other threads compute the surfels of the sweeps, which their
+    /// [`Self::ground`], while other threads compute the surfels of the sweeps, which their
     /// registration needs next.
     pub(crate) fn ground_and_surfels(&self, sweeps: &[&[Point]]) -> Vec<Vec<bool>> {
-        let surfels = || {
-            for points in sweeps {
-                self.sweep_cache.of(points).surface();
-            }
-        };
-        let (ground, ()) = self
-            .threads
-            .install(|| rayon::join(|| self.ground(sweeps), surfels));
-        ground
+        let known: Vec<_> = sweeps
+            .iter()
+            .map(|points| self.sweep_cache.of(points))
+            .collect();
+        let found = known.par_iter().map(|known| {
+            let ground = || known.ground(ground::mask).clone();
+            rayon::join(ground, || _ = known.surface()).0
+        });
+        self.threads.install(|| found.collect())
     }
 
     /// Searches `clouds` for moving objects, large clusters first. If `control` interrupts or too

@@ -14,7 +14,7 @@ use crate::flow::data::locked;
 use crate::flow::registration::SurfelCloud;
 
 /// Bound on the total points of the cached sweeps: about twenty full sweeps. They take about 60 MB
-/// with their surfels, and 230 MB where no two points share a voxel.
+/// with their surfels, and 240 MB where no two points share a voxel.
 const POINTS: usize = 2 << 20;
 /// Bound on the number of cached sweeps. A linear search over them is cheap compared with the
 /// cached computations.

@@ -52,8 +52,9 @@ impl ObjectMotions {
             let is_near = |points: &ColumnIndex| points.nearest(point, 2.0 * REACH_M).is_some();
             is_near(&moving) || is_near(&arrived)
         };
-        let standing = of(false).map(|(&point, _)| point);
-        let standing: Vec<Point> = standing.filter(|&point| matters(point)).collect();
+        let rows = points.par_iter().zip(point_motion);
+        let standing = rows.filter(|&(&point, &owner)| owner == NOISE && matters(point));
+        let standing: Vec<Point> = standing.map(|(&point, _)| point).collect();
         Self {
             motions,
             point_motion: of(true).map(|(_, &owner)| owner).collect(),

@@ -78,10 +78,9 @@ pub(crate) fn align(
     if control.interrupt().is_some() {
         return Registration::given(found);
     }
-    let target = target.fine.all();
     let source = source.fine.some(REFINED);
     let prior = Prior::of_vehicle(prior);
     let (motion, covariance) =
-        Fit::new(&source, target).run_with(&prior, &found, &REFINEMENT, control);
+        Fit::new(&source, &target.fine).run_with(&prior, &found, &REFINEMENT, control);
     Registration { motion, covariance }
 }

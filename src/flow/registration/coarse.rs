@@ -59,7 +59,7 @@ pub(super) fn search(
     control: &dyn Control,
 ) -> RigidTransform {
     let source = source.some(TRIED);
-    let fit = Fit::new(&source, target.all());
+    let fit = Fit::new(&source, target);
     let tried = |starts: &[RigidTransform]| -> Vec<(RigidTransform, f64)> {
         let tried = starts.par_iter().map(|start| {
             let motion = fit.run(start, &TRIAL, control);

@@ -15,7 +15,7 @@ use rayon::prelude::*;
 
 use super::posterior::{Evidence, Posterior, Prior};
 use super::sums::Sums;
-use super::surfels::{AllSurfels, Surfel};
+use super::surfels::{Surfel, Surfels};
 use crate::flow::data::{Control, Point, RigidTransform};
 use crate::flow::spatial::PlaneFit;
 
@@ -65,7 +65,7 @@ impl Schedule {
 /// Source surfels, and the target surfels that they are fitted to.
 pub(super) struct Fit<'a> {
     source: &'a [Surfel],
-    target: AllSurfels<'a>,
+    target: &'a Surfels,
     /// Centroid of the source, which is the center of rotations. The root-mean-square distance of
     /// its points from the centroid scales rotations to metres.
     center: Point3<f64>,
@@ -73,7 +73,7 @@ pub(super) struct Fit<'a> {
 }
 
 impl<'a> Fit<'a> {
-    pub(super) fn new(source: &'a [Surfel], target: AllSurfels<'a>) -> Self {
+    pub(super) fn new(source: &'a [Surfel], target: &'a Surfels) -> Self {
         let count = source.len().max(1) as f64;
         let points = source.iter().map(|surfel| double(surfel.point));
         let sum: Vector3<f64> = points.clone().map(|point| point.coords).sum();

@@ -1,6 +1,7 @@
 //! Surfels: small flat patches of a cloud's surfaces, and a nearest-neighbor search over them.
 //!
-//! A surfel is fitted to the neighbors of a point within a radius.
+//! A surfel is fitted to the neighbors of a point within a radius when it is asked for first: most
+//! points of a target are matched by none of the source points that are registered.
 
 use std::sync::OnceLock;
 
@@ -8,6 +9,9 @@ use rayon::prelude::*;
 
 use crate::flow::data::{Point, get_or_compute, stride_sample};
 use crate::flow::spatial::{ColumnIndex, Neighborhood, PlaneFit};
+
+/// The plane at each point of a cloud, once it is fitted; none where the surface is not flat.
+type Planes = Vec<OnceLock<Option<PlaneFit>>>;
 
 /// Bound on the points of a column of the index.
 const MOST_IN_A_COLUMN: usize = 4096;
@@ -24,22 +28,14 @@ pub(super) struct Surfel {
     pub(super) flat: PlaneFit,
 }
 
-/// The surfels of a voxel-downsampled cloud, computed on first use.
+/// The surfels of a voxel-downsampled cloud, each fitted on first use.
 pub(super) struct Surfels {
     /// Radius of the neighborhoods, metres.
     within_m: f32,
     /// The points in the order of the index.
     points: Vec<Point>,
     index: ColumnIndex,
-    flats: OnceLock<Vec<Option<PlaneFit>>>,
-}
-
-/// All surfels of a cloud.
-#[derive(Clone, Copy)]
-pub(super) struct AllSurfels<'a> {
-    surfels: &'a Surfels,
-    /// One for each point; none where the surface is not flat.
-    flats: &'a [Option<PlaneFit>],
+    flats: Planes,
 }
 
 impl Surfels {
@@ -53,55 +49,38 @@ impl Surfels {
         }
         Self {
             within_m,
+            flats: points.iter().map(|_| OnceLock::new()).collect(),
             points,
             index,
-            flats: OnceLock::new(),
-        }
-    }
-
-    /// All surfels.
-    pub(super) fn all(&self) -> AllSurfels<'_> {
-        let flats = get_or_compute(&self.flats, || self.flats_at(&self.points));
-        AllSurfels {
-            surfels: self,
-            flats,
         }
     }
 
     /// The surfels of at most `most` points, chosen evenly. Points on no flat surface have none.
     pub(super) fn some(&self, most: usize) -> Vec<Surfel> {
-        let points = stride_sample(&self.points, most);
-        let flats = match self.flats.get() {
-            Some(flats) => stride_sample(flats, most),
-            None => self.flats_at(&points),
-        };
-        let surfels = points.into_iter().zip(flats);
-        let surfels = surfels.filter_map(|(point, flat)| Some(Surfel { point, flat: flat? }));
+        let slots: Vec<usize> = (0..self.points.len()).collect();
+        let slots = stride_sample(&slots, most);
+        let chunks = slots.par_chunks(POINTS_AT_ONCE);
+        let surfels = chunks.flat_map_iter(|slots| slots.iter().filter_map(|&slot| self.at(slot)));
         surfels.collect()
     }
 
-    fn flats_at(&self, points: &[Point]) -> Vec<Option<PlaneFit>> {
-        let chunks = points.par_chunks(POINTS_AT_ONCE);
-        let flat_at = |&point: &Point| {
+    /// The surfel whose point is nearest to `point` and less than `within_m` metres from it. None
+    /// where there is no such point, or where its surface is not flat.
+    pub(super) fn nearest(&self, point: Point, within_m: f32) -> Option<Surfel> {
+        let (slot, _) = self.index.nearest_slot(point, within_m)?;
+        self.at(slot)
+    }
+
+    /// The surfel of the point in a slot of the index.
+    fn at(&self, slot: usize) -> Option<Surfel> {
+        let point = self.points[slot];
+        let flat = get_or_compute(&self.flats[slot], || {
             let mut neighborhood = Neighborhood::of(point);
             self.index
                 .within(point, self.within_m, |_, other| neighborhood.add(other));
             neighborhood.flat()
-        };
-        let flats = chunks.flat_map_iter(|points| points.iter().map(flat_at));
-        flats.collect()
-    }
-}
-
-impl AllSurfels<'_> {
-    /// The surfel whose point is nearest to `point` and less than `within_m` metres from it. None
-    /// where there is no such point, or where its surface is not flat.
-    pub(super) fn nearest(&self, point: Point, within_m: f32) -> Option<Surfel> {
-        let (slot, _) = self.surfels.index.nearest_slot(point, within_m)?;
-        Some(Surfel {
-            point: self.surfels.points[slot],
-            flat: self.flats[slot]?,
-        })
+        });
+        flat.map(|flat| Surfel { point, flat })
     }
 }
 
@@ -118,7 +97,6 @@ mod tests {
         let mut point = || [0; 3].map(|_| random.uniform(-4.0, 4.0) as f32);
         let cloud: Vec<Point> = (0..800).map(|_| point()).collect();
         let surfels = Surfels::new(&cloud, 1.0);
-        let surfels = surfels.all();
         for _ in 0..500 {
             let asked = point();
             let square = |other: &Point| square_distance(asked, *other);
@@ -140,7 +118,6 @@ mod tests {
         };
         let plane: Vec<Point> = (0..400).map(on_plane).collect();
         let surfels = Surfels::new(&plane, 1.0);
-        let surfels = surfels.all();
         for &point in &plane {
             let found = surfels.nearest(point, 1.0).expect("flat").flat;
             let PlaneFit {
@@ -154,11 +131,11 @@ mod tests {
         let line = Surfels::new(&line, 1.0);
         assert!(line.some(100).is_empty());
         let nothing = Surfels::new(&[], 1.0);
-        assert!(nothing.all().nearest([0.0; 3], 1.0).is_none());
+        assert!(nothing.nearest([0.0; 3], 1.0).is_none());
     }
 
     #[test]
-    fn some_surfels_are_the_same_whether_all_have_been_asked_for_or_not() {
+    fn some_surfels_are_the_same_whether_others_have_been_asked_for_or_not() {
         let mut random = Random::new(3);
         let mut point = || [4.0, 4.0, 0.1].map(|side| random.uniform(-side, side) as f32);
         let cloud: Vec<Point> = (0..900).map(|_| point()).collect();
@@ -169,8 +146,9 @@ mod tests {
                 .collect()
         };
         let before = bits(surfels.some(200));
-        surfels.all();
+        let others = Surfels::new(&cloud, 1.0);
+        assert!(others.some(600).len() > before.len());
         assert!(before.len() > 100);
-        assert_eq!(bits(surfels.some(200)), before);
+        assert_eq!(bits(others.some(200)), before);
     }
 }

@@ -32,8 +32,9 @@ pub(crate) struct PlaneFit {
 pub(crate) struct Neighborhood {
     middle: Point,
     count: f64,
-    sum: Vector3<f64>,
-    squares: Matrix3<f64>,
+    sum: [f64; 3],
+    /// Sums of x x, x y, x z, y y, y z and z z.
+    products: [f64; 6],
 }
 
 impl Neighborhood {
@@ -42,18 +43,24 @@ impl Neighborhood {
         Self {
             middle,
             count: 0.0,
-            sum: Vector3::zeros(),
-            squares: Matrix3::zeros(),
+            sum: [0.0; 3],
+            products: [0.0; 6],
         }
     }
 
     /// Adds a point.
     #[inline]
     pub(crate) fn add(&mut self, point: Point) {
-        let away = Vector3::from_fn(|a, _| f64::from(point[a] - self.middle[a]));
+        let away: [f64; 3] = core::array::from_fn(|a| f64::from(point[a] - self.middle[a]));
+        let [x, y, z] = away;
         self.count += 1.0;
-        self.sum += away;
-        self.squares += away * away.transpose();
+        for (sum, c) in self.sum.iter_mut().zip(away) {
+            *sum += c;
+        }
+        let products = [x * x, x * y, x * z, y * y, y * z, z * z];
+        for (sum, product) in self.products.iter_mut().zip(products) {
+            *sum += product;
+        }
     }
 
     /// The plane of the points; none where there are fewer than four, or where they do not lie on a
@@ -62,8 +69,10 @@ impl Neighborhood {
         if self.count < NEIGHBORS {
             return None;
         }
-        let mean = self.sum / self.count;
-        let mean_square = self.squares / self.count;
+        let mean = Vector3::from(self.sum) / self.count;
+        let [xx, xy, xz, yy, yz, zz] = self.products;
+        let squares = Matrix3::new(xx, xy, xz, xy, yy, yz, xz, yz, zz);
+        let mean_square = squares / self.count;
         let mut plane = flat(&(mean_square - mean * mean.transpose()))?;
         plane.thickness += UNCERTAIN * (NEIGHBORS / self.count).powi(5) as f32;
         Some(plane)
