@@ -64,6 +64,14 @@ impl<V: Copy + Default> KeyTable<V> {
         &mut self.slots[slot].1
     }
 
+    /// Whether the key is new. It is not from now on.
+    #[inline]
+    pub(super) fn insert(&mut self, key: u64) -> bool {
+        let before = self.used;
+        self.entry(key);
+        self.used > before
+    }
+
     /// Number of keys.
     pub(super) fn len(&self) -> usize {
         self.used

@@ -12,17 +12,23 @@ const EXPECTED: usize = 2;
 /// the order of their first points. Points beyond [`REACH`] voxels and points that are not finite are
 /// dropped.
 pub(crate) fn voxel_mean(points: &[Point], side_m: f32) -> Vec<Point> {
-    let is_in_reach = |point: &&Point| point.iter().all(|c| (c / side_m).abs() < REACH);
+    let is_in_reach = |point: &Point| point.iter().all(|c| (c / side_m).abs() < REACH);
+    let keys = keys(points, side_m);
     let mut numbers = KeyTable::<u32>::new(points.len() / EXPECTED);
     let mut sums: Vec<([f64; 3], f64)> = Vec::new();
-    for point in points.iter().filter(is_in_reach) {
-        // Zero is the number of a new voxel.
-        let number = numbers.entry(key(*point, side_m));
-        if *number == 0 {
-            sums.push(([0.0; 3], 0.0));
-            *number = sums.len() as u32;
+    let mut last = (u64::MAX, 0);
+    for (point, &key) in points.iter().zip(&keys).filter(|(p, _)| is_in_reach(p)) {
+        // Points that follow each other often share a voxel.
+        if last.0 != key {
+            // Zero is the number of a new voxel.
+            let number = numbers.entry(key);
+            if *number == 0 {
+                sums.push(([0.0; 3], 0.0));
+                *number = sums.len() as u32;
+            }
+            last = (key, *number as usize - 1);
         }
-        let (sum, count) = &mut sums[*number as usize - 1];
+        let (sum, count) = &mut sums[last.1];
         for (sum, &c) in sum.iter_mut().zip(point) {
             *sum += f64::from(c);
         }
@@ -38,21 +44,27 @@ pub(crate) fn voxel_mean(points: &[Point], side_m: f32) -> Vec<Point> {
 /// order. Points beyond [`REACH`] voxels share the outermost voxels. All coordinates must be
 /// finite.
 pub(crate) fn voxel_first(points: &[Point], side_m: f32) -> Vec<u32> {
-    let mut seen = KeyTable::<bool>::new(points.len() / EXPECTED);
+    let mut seen = KeyTable::<()>::new(points.len() / EXPECTED);
+    let mut rows = Vec::with_capacity(points.len());
     let mut last = u64::MAX;
-    let is_first = |row: &u32| {
-        let key = key(points[*row as usize], side_m);
+    for (&key, row) in keys(points, side_m).iter().zip(0..) {
         // Points that follow each other often share a voxel.
-        core::mem::replace(&mut last, key) != key && !core::mem::replace(seen.entry(key), true)
-    };
-    (0..points.len() as u32).filter(is_first).collect()
+        if core::mem::replace(&mut last, key) != key && seen.insert(key) {
+            rows.push(row);
+        }
+    }
+    rows
 }
 
-/// The key of a point's voxel: 21 bits an axis, x in the highest.
-fn key(point: Point, side_m: f32) -> u64 {
+/// The keys of the points' voxels: 21 bits an axis, x in the highest. A loop of their own is twice as
+/// fast as one that also searches the table.
+fn keys(points: &[Point], side_m: f32) -> Vec<u64> {
     let index = |c: f32| (floor(c / side_m).clamp(-REACH, REACH - 1.0) + REACH) as u64;
-    let [x, y, z] = point.map(index);
-    x << 42 | y << 21 | z
+    let key = |point: &Point| {
+        let [x, y, z] = point.map(index);
+        x << 42 | y << 21 | z
+    };
+    points.iter().map(key).collect()
 }
 
 #[cfg(test)]
