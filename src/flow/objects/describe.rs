@@ -91,7 +91,9 @@ impl Objects {
             objects.cluster[rows[i]] = cluster as i32;
             members[cluster as usize].push(i);
         }
-        let described = motions.par_iter().zip(&members).map(|(&motion, members)| {
+        // The first clusters hold most of the points, so that each is a task of its own.
+        let described = motions.par_iter().zip(&members).with_max_len(1);
+        let described = described.map(|(&motion, members)| {
             let points: Vec<Point> = members.iter().map(|&i| points[i]).collect();
             let mean = |probabilities: &[f32]| {
                 let sum: f32 = members.iter().map(|&i| probabilities[rows[i]]).sum();

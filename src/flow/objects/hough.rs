@@ -5,7 +5,7 @@
 
 use std::cmp::Reverse;
 
-use super::scene::Scene;
+use super::clouds::TargetCloud;
 use crate::flow::data::Point;
 use crate::flow::options::ObjectOptions;
 use crate::flow::spatial::ColumnIndex;
@@ -27,15 +27,15 @@ pub(super) struct TranslationVotes {
 }
 
 impl TranslationVotes {
-    /// For the target of `scene`.
-    pub(super) fn new(scene: &Scene<'_>) -> Self {
+    /// For a target.
+    pub(super) fn new(target: &TargetCloud, options: &ObjectOptions) -> Self {
         let ObjectOptions {
             bin_m,
             max_displacement_m,
             ..
-        } = *scene.options;
-        let kept = voxel_first(&scene.target, bin_m);
-        let points: Vec<Point> = kept.iter().map(|&row| scene.target[row as usize]).collect();
+        } = *options;
+        let kept = voxel_first(&target.points, bin_m);
+        let points: Vec<Point> = kept.iter().map(|&row| target.points[row as usize]).collect();
         Self {
             near: ColumnIndex::new(&points, max_displacement_m / 3.0),
             bin_m,
@@ -132,9 +132,8 @@ mod tests {
             .iter()
             .map(|&[x, y, z]| [x + shift[0], y + shift[1], z]);
         let target: Vec<Point> = moved.collect();
-        let downsampled = SourceCloud::new(&source, &[NOISE; 80], &options);
-        let scene = Scene::new(&downsampled, &TargetCloud::new(&target, &options), &options);
-        let peaks = TranslationVotes::new(&scene).peaks(&source, 4, 3.0);
+        let target = TargetCloud::new(&target, &options);
+        let peaks = TranslationVotes::new(&target, &options).peaks(&source, 4, 3.0);
         assert_eq!(peaks.len(), 4);
         let [x, y] = [0, 1].map(|a| (peaks[0][a] - shift[a]).abs());
         assert!(x <= options.bin_m && y <= options.bin_m, "{peaks:?}");
@@ -149,16 +148,8 @@ mod tests {
     #[test]
     fn points_without_a_target_have_no_peaks() {
         let options = ObjectOptions::default();
-        let downsampled = SourceCloud::new(&[[0.0; 3]], &[NOISE], &options);
-        let scene = Scene::new(
-            &downsampled,
-            &TargetCloud::new(&[[50.0; 3]], &options),
-            &options,
-        );
-        assert!(
-            TranslationVotes::new(&scene)
-                .peaks(&[[0.0; 3]], 4, 3.0)
-                .is_empty()
-        );
+        let target = TargetCloud::new(&[[50.0; 3]], &options);
+        let votes = TranslationVotes::new(&target, &options);
+        assert!(votes.peaks(&[[0.0; 3]], 4, 3.0).is_empty());
     }
 }

@@ -44,14 +44,14 @@ impl ObjectMotions {
         let arrived: Vec<Point> = of(true)
             .map(|(&point, &owner)| motions[owner as usize].apply(point))
             .collect();
-        let [moving, arrived] =
-            [&moving, &arrived].map(|points| ColumnIndex::new(points, 2.0 * REACH_M));
+        let both = [moving.as_slice(), &arrived].concat();
+        let (moving, both) = rayon::join(
+            || ColumnIndex::new(&moving, 2.0 * REACH_M),
+            || ColumnIndex::new(&both, 2.0 * REACH_M),
+        );
         // A static point farther from all moving points, before and after their motion, is never the
         // nearest to a position that may move.
-        let matters = |point: Point| {
-            let is_near = |points: &ColumnIndex| points.nearest(point, 2.0 * REACH_M).is_some();
-            is_near(&moving) || is_near(&arrived)
-        };
+        let matters = |point: Point| both.nearest(point, 2.0 * REACH_M).is_some();
         let rows = points.par_iter().zip(point_motion);
         let standing = rows.filter(|&(&point, &owner)| owner == NOISE && matters(point));
         let standing: Vec<Point> = standing.map(|(&point, _)| point).collect();

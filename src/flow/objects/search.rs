@@ -172,8 +172,10 @@ pub(crate) fn find_objects<E: Send>(
     if let Some(interrupt) = out_of_time(control, clouds_seconds * SCENES) {
         return Ok(ObjectSearch::nothing(interrupt));
     }
-    let scene = Scene::new(&downsampled, &others[0], options);
-    let votes = TranslationVotes::new(&scene);
+    let (scene, votes) = rayon::join(
+        || Scene::new(&downsampled, &others[0], options),
+        || TranslationVotes::new(&others[0], options),
+    );
     let neighbors: Vec<NeighborView<'_>> = clouds
         .neighbors
         .par_iter()

@@ -76,14 +76,16 @@ pub(crate) fn clusters(points: &[Point], radius_m: f32, least: usize) -> Vec<u32
     let beside = |&(cell, row): &(usize, u32)| {
         let position = points[row as usize];
         let mut best = (f32::INFINITY, NOISE);
-        for other in grid.near(cell).flatten() {
-            for &core in cores.of(other) {
-                let far = square_distance(position, core);
-                if far <= square && far < best.0 {
-                    best = (far, root[other]);
+        grid.each_near(cell, 0, |near| {
+            for other in near {
+                for &core in cores.of(other) {
+                    let far = square_distance(position, core);
+                    if far <= square && far < best.0 {
+                        best = (far, root[other]);
+                    }
                 }
             }
-        }
+        });
         best.1
     };
     let found: Vec<u32> = others.par_iter().map(beside).collect();
@@ -143,7 +145,7 @@ fn connected(grid: &Cells, cores: &CorePoints, square: f32) -> Vec<u32> {
             let mut inside = Sets::new(end.saturating_sub(first));
             let mut across = Vec::new();
             for cell in (first..end).filter(|&cell| !cores.of(cell).is_empty()) {
-                for near in grid.near(cell) {
+                grid.each_near(cell, grid.column_of[cell], |near| {
                     for other in near.start.max(cell + 1)..near.end {
                         if other >= end {
                             if cores.touch(cell, other, square) {
@@ -156,7 +158,7 @@ fn connected(grid: &Cells, cores: &CorePoints, square: f32) -> Vec<u32> {
                             inside.join(a, b);
                         }
                     }
-                }
+                });
             }
             (inside, across)
         })
@@ -238,8 +240,10 @@ impl Cells {
             .map(|&row| key(points[row as usize], side_m))
             .collect();
         let mut table = KeyTable::<u32>::new(points.len() / EXPECTED);
-        for &key in &keys {
-            *table.entry(key) += 1;
+        // Points that follow each other often share a cell.
+        let runs = || keys.chunk_by(u64::eq);
+        for run in runs() {
+            *table.entry(run[0]) += run.len() as u32;
         }
         // Counting sort: the number of a cell's members becomes the place of the next one.
         let mut cells: Vec<(u64, u32)> = Vec::new();
@@ -251,10 +255,13 @@ impl Cells {
         }
         cells.push((u64::MAX, next));
         let mut in_cells = vec![0; rows.len()];
-        for (&row, &key) in rows.iter().zip(&keys) {
-            let place = table.entry(key);
-            in_cells[*place as usize] = row;
-            *place += 1;
+        let mut left = &rows[..];
+        for run in runs() {
+            let (of_run, others) = left.split_at(run.len());
+            let place = table.entry(run[0]);
+            in_cells[*place as usize..][..run.len()].copy_from_slice(of_run);
+            *place += run.len() as u32;
+            left = others;
         }
         let (columns, column_of) = columns(&cells[..cells.len() - 1]);
         Self {
@@ -280,32 +287,35 @@ impl Cells {
         self.cells[cells.start].1 as usize..self.cells[cells.end].1 as usize
     }
 
-    /// The cells that may hold points within the radius of this cell's points, this cell included:
-    /// ranges in ascending order, one for each column that has some.
-    fn near(&self, cell: usize) -> impl Iterator<Item = Range<usize>> {
+    /// Calls `see` with the cells that may hold points within the radius of this cell's points, this
+    /// cell included: ranges in ascending order, one for each column from `first` on that has some.
+    fn each_near(&self, cell: usize, first: u32, mut see: impl FnMut(Range<usize>)) {
         let height = |key: u64| key & ((1 << HEIGHT) - 1);
         let z = height(self.cells[cell].0);
-        let around = &self.columns[self.column_of[cell] as usize].around;
-        let columns = around
-            .iter()
-            .flat_map(|range| &self.columns[range.start as usize..range.end as usize]);
-        columns.filter_map(move |column| {
-            let range = column.cells.start as usize..column.cells.end as usize;
-            let cells = &self.cells[range.clone()];
-            let low = cells.partition_point(|&(key, _)| height(key) + 2 < z);
-            let near = cells[low..].iter();
-            let count = near.take_while(|&&(key, _)| height(key) <= z + 2).count();
-            let low = range.start + low;
-            (count > 0).then(|| low..low + count)
-        })
+        for range in &self.columns[self.column_of[cell] as usize].around {
+            for column in range.start.max(first)..range.end {
+                let Range { start, end } = self.columns[column as usize].cells;
+                let cells = &self.cells[start as usize..end as usize];
+                let low = cells.partition_point(|&(key, _)| height(key) + 2 < z);
+                let near = cells[low..].iter();
+                let count = near.take_while(|&&(key, _)| height(key) <= z + 2).count();
+                if count > 0 {
+                    let low = start as usize + low;
+                    see(low..low + count);
+                }
+            }
+        }
     }
 
     /// The core points among a cell's members: those with `least` points within the radius.
     fn cores(&self, cell: usize, square: f32, least: usize) -> Vec<u32> {
         let mut near = [const { 0..0 }; AROUND * AROUND];
-        for (places, cells) in near.iter_mut().zip(self.near(cell)) {
-            *places = self.places(&cells);
-        }
+        let mut columns = near.iter_mut();
+        self.each_near(cell, 0, |cells| {
+            if let Some(places) = columns.next() {
+                *places = self.places(&cells);
+            }
+        });
         let is_core = |place: &usize| {
             let position = self.sorted[*place];
             let mut left = least;

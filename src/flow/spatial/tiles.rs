@@ -44,8 +44,12 @@ impl Tiles {
         let columns = points.iter().map(|&point| column_of(point, columns_per_m));
         let columns: Vec<[i32; 2]> = columns.collect();
         let mut table = KeyTable::<Tile>::new(0);
-        for &column in &columns {
-            table.entry(key(tile_of(column))).occupied |= bit(column);
+        // Points that follow each other often share a tile.
+        for run in columns.chunk_by(|&a, &b| tile_of(a) == tile_of(b)) {
+            let tile = table.entry(key(tile_of(run[0])));
+            for &column in run {
+                tile.occupied |= bit(column);
+            }
         }
         let mut count = 0;
         for key in table.sorted() {
@@ -53,7 +57,6 @@ impl Tiles {
             tile.first = count;
             count += tile.occupied.count_ones();
         }
-        // Neighboring points often lie in one tile.
         let mut last = (key([i32::MIN; 2]), Tile::default());
         let numbers = columns.iter().map(|&column| {
             let wanted = key(tile_of(column));
