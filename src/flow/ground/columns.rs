@@ -101,7 +101,7 @@ impl Columns {
         let outside = side * side;
         let cell = |point: &Point| {
             if reach(point) < half_m {
-                let [u, v] = [0, 1].map(|axis| ((point[axis] + half_m) / SIDE_M) as usize);
+                let [u, v] = [0, 1].map(|axis| ((point[axis] + half_m) / SIDE_M) as u32 as usize);
                 v.min(side - 1) * side + u.min(side - 1)
             } else {
                 outside
@@ -149,7 +149,7 @@ fn reach(point: &Point) -> f32 {
 /// Order by height, then by x, then by y.
 fn low_to_high(a: &Point, b: &Point) -> std::cmp::Ordering {
     let by = |axis: usize| a[axis].total_cmp(&b[axis]);
-    by(2).then(by(0)).then(by(1))
+    by(2).then_with(|| by(0)).then_with(|| by(1))
 }
 
 #[cfg(test)]

@@ -54,7 +54,7 @@ impl HeightField {
     /// Height at (x, y), metres; outside the area, the height at the nearest border point.
     pub(super) fn height_at(&self, x: f32, y: f32) -> f32 {
         let [u, v] = self.position(x, y);
-        let [column, row] = [u, v].map(|position| (position as usize).min(self.side - 2));
+        let [column, row] = [u, v].map(|position| (position as u32 as usize).min(self.side - 2));
         let [along, across] = [u - column as f32, v - row as f32];
         let node = row * self.side + column;
         let between =
@@ -102,7 +102,7 @@ impl HeightField {
     fn nearest(&self, point: &Point) -> usize {
         let [column, row] = self
             .position(point[0], point[1])
-            .map(|position| position.round() as usize);
+            .map(|position| position.round() as u32 as usize);
         row * self.side + column
     }
 

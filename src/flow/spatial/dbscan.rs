@@ -368,7 +368,7 @@ fn columns(cells: &[(u64, u32)]) -> (Vec<Column>, Vec<u32>) {
 }
 
 fn key(point: Point, side_m: f32) -> u64 {
-    let at = |c: f32| (floor(c / side_m).clamp(-REACH, REACH) + REACH + 4.0) as u64;
+    let at = |c: f32| u64::from((floor(c / side_m).clamp(-REACH, REACH) + REACH + 4.0) as u32);
     at(point[0]) << (2 * HEIGHT) | at(point[1]) << HEIGHT | at(point[2])
 }
 

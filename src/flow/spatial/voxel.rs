@@ -59,9 +59,9 @@ pub(crate) fn voxel_first(points: &[Point], side_m: f32) -> Vec<u32> {
 /// The keys of the points' voxels: 21 bits an axis, x in the highest. A loop of their own is twice as
 /// fast as one that also searches the table.
 fn keys(points: &[Point], side_m: f32) -> Vec<u64> {
-    let index = |c: f32| (floor(c / side_m).clamp(-REACH, REACH - 1.0) + REACH) as u64;
+    let index = |c: f32| (floor(c / side_m).clamp(-REACH, REACH - 1.0) + REACH) as u32;
     let key = |point: &Point| {
-        let [x, y, z] = point.map(index);
+        let [x, y, z] = point.map(|c| u64::from(index(c)));
         x << 42 | y << 21 | z
     };
     points.iter().map(key).collect()
