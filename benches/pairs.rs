@@ -1,4 +1,4 @@
-//! Whole pairs: the phases of `default`, and every preset at several sizes.
+//! Whole pairs: the phases of `default`, the machine's ceilings, and every preset at several sizes.
 //!
 //! ```text
 //! FNSF_REAL_DATA=... cargo bench --bench pairs
@@ -10,7 +10,7 @@ mod common;
 use std::time::Instant;
 
 use common::{Scene, median, scenes, street};
-use fnsf::flow::cpu::CpuBackend;
+use fnsf::flow::cpu::{CpuBackend, Isa, multiply_add_peak};
 use fnsf::flow::field::Backend;
 use fnsf::flow::{Control, Estimate, Options, Preset, Problem, Solution, estimate};
 
@@ -33,7 +33,60 @@ fn queries(estimate: &Estimate) -> f64 {
 fn main() -> Result<(), String> {
     let scenes = scenes()?;
     objects_by_phase(&scenes)?;
+    ceilings();
     presets_by_size(&scenes)
+}
+
+/// What one thread of the machine can do at most: the phases are compared with it.
+fn ceilings() {
+    const ROUNDS: usize = 5;
+    /// Repetitions of a few vector multiply-adds.
+    const REPETITIONS: usize = 2_000_000;
+    /// Lines of 64 bytes that no cache holds.
+    const BUFFER: usize = 4 << 20;
+    /// Lines of about the size of an index of points.
+    const TABLE: usize = 64 << 10;
+    /// Lines that are read in random order.
+    const GATHERED: usize = 4 << 20;
+    let best = |work: &mut dyn FnMut() -> f64| {
+        let rate = || {
+            let began = Instant::now();
+            work() / began.elapsed().as_secs_f64()
+        };
+        std::iter::repeat_with(rate)
+            .take(ROUNDS)
+            .fold(0.0, f64::max)
+    };
+    let lines = vec![[1.0_f32; 16]; BUFFER];
+    let peak = best(&mut || multiply_add_peak(Isa::available()[0], REPETITIONS));
+    let streamed = best(&mut || {
+        let sums = lines.iter().fold([0.0_f32; 16], |sums, line| {
+            core::array::from_fn(|lane| sums[lane] + line[lane])
+        });
+        std::hint::black_box(sums);
+        size_of_val(lines.as_slice()) as f64
+    });
+    let gathered = best(&mut || {
+        let (mut at, mut sum) = (1_usize, 0.0);
+        for _ in 0..GATHERED {
+            // A linear congruential generator: the next address does not wait for the load.
+            at = at.wrapping_mul(0x5851_F42D_4C95_7F2D).wrapping_add(1);
+            sum += lines[(at >> 40) % TABLE][0];
+        }
+        std::hint::black_box(sum);
+        GATHERED as f64
+    });
+    println!("Ceilings of one thread, best of {ROUNDS}\n");
+    println!(
+        "| multiply-adds, GFLOP/s | reads from memory, GB/s | random lines of 4 MB, ns each |"
+    );
+    println!("|---|---|---|");
+    println!(
+        "| {:.0} | {:.1} | {:.1} |\n",
+        peak / 1e9,
+        streamed / 1e9,
+        1e9 / gathered
+    );
 }
 
 /// Numbers of beams and azimuth steps of the streets beside the pairs. The last has a million

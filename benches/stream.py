@@ -17,6 +17,7 @@ import threading
 import time
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 
 def parsed(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
@@ -45,7 +46,7 @@ def play(sweeps: list[bytes], ending: str, folder: Path, asked: argparse.Namespa
     return late
 
 
-def watch(process: subprocess.Popen[str], resident: list[float]) -> None:
+def watch(process: subprocess.Popen[Any], resident: list[float]) -> None:
     """Appends the resident set of the process, MB, every half second."""
     while process.poll() is None:
         status = Path(f"/proc/{process.pid}/status")

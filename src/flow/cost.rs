@@ -24,7 +24,7 @@ const ALIGNING: f64 = 4e9;
 /// Cost per point of the registration's voxel downsampling and surfels, multiply-adds.
 const THINNING: f64 = 2e4;
 /// Peak bytes per point of the same step: the point, a cached copy, its voxel and its surfels.
-const THINNING_BYTES: usize = 96;
+const THINNING_BYTES: usize = 112;
 /// Peak bytes per point of either cloud where nothing is registered: the ground, the clouds without
 /// it, and the indices by which their overlap is measured.
 const OVERLAP_BYTES: usize = 96;
@@ -116,6 +116,20 @@ pub fn neighbor_cost(points: usize) -> NeighborCost {
 /// [`super::estimate()`]. The ground masks of neighbor sweeps and the limits of a device are not
 /// checked.
 pub fn predict_cost(problem: &Problem, options: &Options) -> Result<Cost, FlowError> {
+    on_one_thread(|| predicted(problem, options))
+}
+
+/// Does `work` on one thread. A prediction takes one core from the pairs that are being computed, and
+/// no more.
+fn on_one_thread<T: Send>(work: impl FnOnce() -> T + Send) -> T {
+    match rayon::ThreadPoolBuilder::new().num_threads(1).build() {
+        Ok(thread) => thread.install(work),
+        Err(_) => work(),
+    }
+}
+
+/// [`predict_cost`], on the calling thread's pool.
+fn predicted(problem: &Problem, options: &Options) -> Result<Cost, FlowError> {
     let selection = select(
         problem,
         [problem.source, problem.target],
@@ -237,12 +251,7 @@ fn field_cost(
 /// those of its own cluster. None where the source is not partitioned.
 fn cluster_points(source: &[Point], options: &FieldOptions) -> Option<usize> {
     let partition = options.partition.as_ref()?;
-    let clusters = || dbscan::clusters(source, partition.radius_m, partition.min_points);
-    // A prediction takes one core from the pairs that are being computed, and no more.
-    let labels = match rayon::ThreadPoolBuilder::new().num_threads(1).build() {
-        Ok(thread) => thread.install(clusters),
-        Err(_) => clusters(),
-    };
+    let labels = dbscan::clusters(source, partition.radius_m, partition.min_points);
     let members = dbscan::members(&labels);
     let sizes = || members.iter().map(Vec::len);
     let squares: usize = sizes().map(|size| size * size).sum();

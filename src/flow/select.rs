@@ -44,9 +44,9 @@ pub(crate) fn find_ground(sweeps: &[&[Point]]) -> Vec<Vec<bool>> {
     sweeps.iter().map(|points| ground::mask(points)).collect()
 }
 
-/// Selects the points of `problem` by `options`, the two clouds in parallel. `given` are the source and the target as they were
-/// measured, before any deskewing: a point is within the crop and far enough from the sensor where both
-/// of its positions are.
+/// Selects the points of `problem` by `options`. The two clouds are selected in parallel. `given` are
+/// the source and the target as they were measured, before any deskewing: a point is within the crop
+/// and far enough from the sensor where both of its positions are.
 ///
 /// # Errors
 /// [`FlowError`] where coordinates are not metres, a mask is missing or has another length, or fewer
@@ -236,11 +236,11 @@ pub(crate) fn ground_masks<'a, const SWEEPS: usize>(
 
 /// All points that are finite and within the crop.
 pub(crate) fn cropped<'a>(points: &'a [Point], options: &Options) -> Cow<'a, [Point]> {
-    let is_kept = |&&point: &&Point| is_in_crop(point, options);
-    if points.iter().all(|point| is_kept(&point)) {
+    let is_kept = |point: &Point| is_in_crop(*point, options);
+    if points.iter().all(is_kept) {
         return Cow::Borrowed(points);
     }
-    Cow::Owned(points.iter().filter(is_kept).copied().collect())
+    Cow::Owned(points.iter().copied().filter(is_kept).collect())
 }
 
 /// Whether a point is finite, within the crop and not too near.
@@ -255,9 +255,7 @@ pub(crate) fn is_in_crop([x, y, z]: Point, options: &Options) -> bool {
 /// [`is_in_crop`].
 fn rows_in_crop([points, given]: [&[Point]; 2], options: &Options) -> impl Fn(usize) -> bool {
     let is_moved = !std::ptr::eq(points, given);
-    move |row| {
-        is_in_crop(points[row], options) && (!is_moved || is_in_crop(given[row], options))
-    }
+    move |row| is_in_crop(points[row], options) && (!is_moved || is_in_crop(given[row], options))
 }
 
 fn rows_of_pair(
@@ -321,7 +319,7 @@ mod tests {
         selected(&problem, options).rows
     }
 
-    fn selected(problem: &Problem<'_>, options: &Options) -> Selection {
+    fn selected<'a>(problem: &Problem<'a>, options: &Options) -> Selection<'a> {
         let given = [problem.source, problem.target];
         select(problem, given, options, &find_ground).expect("enough points")
     }
@@ -393,7 +391,7 @@ mod tests {
         assert_eq!(selection.source.len(), 10);
         assert_eq!(
             selection.registration_clouds,
-            Some([(); 2].map(|()| source[..=60].to_vec()))
+            Some([(); 2].map(|()| Cow::Borrowed(&source[..=60])))
         );
         options.ego = Ego::Off;
         let selection = selected(&problem, &options);

@@ -104,9 +104,10 @@ impl Rectangle {
 /// The points that may be corners of the convex hull: without those inside the octagon of the
 /// outermost points along both axes and both diagonals (Akl and Toussaint 1978).
 fn outer(points: Vec<[f64; 2]>) -> Vec<[f64; 2]> {
-    /// Points of which a sort costs less than this.
+    /// Up to this many points, sorting all of them costs less.
     const FEW: usize = 64;
-    /// Share of the extent by which a point lies inside: far above the rounding of a cross product.
+    /// A point is inside if it is at least this share of the extent from every edge: far above the
+    /// rounding of a cross product.
     const INSIDE: f64 = 1e-9;
     if points.len() <= FEW {
         return points;
@@ -264,7 +265,7 @@ mod tests {
             let mut coordinate = || random.uniform(-50.0, 50.0);
             let points: Vec<[f64; 2]> = (0..count).map(|_| [coordinate(), coordinate()]).collect();
             let corners = hull(points.clone());
-            // A corner is one that a line parts from all other points: the edges show it.
+            // All points lie to the left of every edge.
             for (i, &a) in corners.iter().enumerate() {
                 let b = corners[(i + 1) % corners.len()];
                 assert!(points.iter().all(|&point| cross(a, b, point) >= 0.0));

@@ -48,8 +48,8 @@ pub struct Estimate {
     /// Name of the processor that ran the method, for reports: the device of a field, or the host's
     /// threads for objects.
     pub device: String,
-    /// Seconds of the first stage, by the control's clock: deskewing, selection and ground
-    /// segmentation. Zero if the control keeps no time.
+    /// Seconds of the first stage, by the control's clock: deskewing, selection, ground segmentation,
+    /// and beside it the downsampling for the registration. Zero if the control keeps no time.
     pub selection_seconds: f64,
     /// Seconds of all stages before the method, by the control's clock: selection, ground
     /// segmentation, distance transform, ego motion and the registration of neighbor sweeps. Zero

@@ -90,8 +90,9 @@ fn estimate_from(
     let (problem, options) = (&problem, options.as_ref());
     let host = backend.host();
     let find_ground = |sweeps: &[&[Point]]| {
-        let points = sweeps.iter().map(|sweep| sweep.len()).sum();
-        if options.ego == Ego::Auto && has_time_for(points, control) {
+        // Twice the time, since the ground takes some of it.
+        let points: usize = sweeps.iter().map(|sweep| sweep.len()).sum();
+        if options.ego == Ego::Auto && has_time_for(2 * points, control) {
             host.ground_and_surfels(sweeps)
         } else {
             host.ground(sweeps)

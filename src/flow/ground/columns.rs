@@ -101,6 +101,7 @@ impl Columns {
         let outside = side * side;
         let cell = |point: &Point| {
             if reach(point) < half_m {
+                // Never negative, and a conversion to 32 bits takes one instruction.
                 let [u, v] = [0, 1].map(|axis| ((point[axis] + half_m) / SIDE_M) as u32 as usize);
                 v.min(side - 1) * side + u.min(side - 1)
             } else {

@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use super::sweep_cache::SweepCache;
+use super::sweep_cache::{self, CachedSweep, SweepCache};
 use crate::flow::data::{Control, Point, RigidTransform};
 use crate::flow::objects::{ClusterDevice, ObjectSearch, SearchClouds};
 use crate::flow::options::ObjectOptions;
@@ -117,28 +117,35 @@ impl Host {
 
     /// Ground masks of the sweeps, one flag a point. All points must be finite and in range.
     pub(crate) fn ground(&self, sweeps: &[&[Point]]) -> Vec<Vec<bool>> {
-        let known: Vec<_> = sweeps
-            .iter()
-            .map(|points| self.sweep_cache.of(points))
-            .collect();
-        let found = known
-            .par_iter()
-            .map(|known| known.ground(ground::mask).clone());
-        self.threads.install(|| found.collect())
+        self.of_each(sweeps, |known| known.ground(ground::mask).clone())
     }
 
-    /// [`Self::ground`], while other threads compute the surfels of the sweeps, which their
+    /// [`Self::ground`], and beside it the downsampled clouds and the indices of the sweeps, which their
     /// registration needs next.
     pub(crate) fn ground_and_surfels(&self, sweeps: &[&[Point]]) -> Vec<Vec<bool>> {
+        let points: usize = sweeps.iter().map(|points| points.len()).sum();
+        if points > sweep_cache::POINTS {
+            // They would not be kept until the registration.
+            return self.ground(sweeps);
+        }
+        self.of_each(sweeps, |known| {
+            let ground = || known.ground(ground::mask).clone();
+            rayon::join(ground, || _ = known.surface()).0
+        })
+    }
+
+    /// `compute` of each sweep, in parallel.
+    fn of_each<T: Send>(
+        &self,
+        sweeps: &[&[Point]],
+        compute: impl Fn(&CachedSweep) -> T + Sync,
+    ) -> Vec<T> {
         let known: Vec<_> = sweeps
             .iter()
             .map(|points| self.sweep_cache.of(points))
             .collect();
-        let found = known.par_iter().map(|known| {
-            let ground = || known.ground(ground::mask).clone();
-            rayon::join(ground, || _ = known.surface()).0
-        });
-        self.threads.install(|| found.collect())
+        self.threads
+            .install(|| known.par_iter().map(|known| compute(known)).collect())
     }
 
     /// Searches `clouds` for moving objects, large clusters first. If `control` interrupts or too

@@ -15,7 +15,7 @@ use crate::flow::registration::SurfelCloud;
 
 /// Bound on the total points of the cached sweeps: about twenty full sweeps. They take about 60 MB
 /// with their surfels, and 240 MB where no two points share a voxel.
-const POINTS: usize = 2 << 20;
+pub(super) const POINTS: usize = 2 << 20;
 /// Bound on the number of cached sweeps. A linear search over them is cheap compared with the
 /// cached computations.
 const SWEEPS: usize = 64;
@@ -34,7 +34,8 @@ impl CachedSweep {
         get_or_compute(&self.ground, || find(&self.points))
     }
 
-    /// Surfels for the registration, computed on first use.
+    /// Surfels for the registration. Their points and indices are computed on first use, and a plane
+    /// where the registration asks for it.
     pub(crate) fn surface(&self) -> &SurfelCloud {
         get_or_compute(&self.surface, || SurfelCloud::new(&self.points))
     }

@@ -8,7 +8,6 @@
 use super::motion_field::ObjectMotions;
 use super::planar_motion::PlanarMotion;
 use crate::flow::data::{Body, EnvelopeError, Point};
-use crate::flow::spatial::NOISE;
 
 const MOTION_BYTES: usize = 5 * size_of::<f32>();
 const POINT_BYTES: usize = 3 * size_of::<f32>();
@@ -53,21 +52,21 @@ impl ObjectMotions {
             });
         }
         let count = body.count_of(POINT_BYTES + size_of::<u32>())?;
-        let mut points: Vec<Point> = Vec::with_capacity(count);
-        let mut point_motion = Vec::with_capacity(count);
+        let mut moving: Vec<(Point, u32)> = Vec::with_capacity(count);
         for _ in 0..count {
-            points.push([finite(body)?, finite(body)?, finite(body)?]);
+            let point = [finite(body)?, finite(body)?, finite(body)?];
             let owner = u32::from_le_bytes(body.take()?);
             if owner as usize >= motions.len() {
                 return Err(EnvelopeError::Damaged);
             }
-            point_motion.push(owner);
+            moving.push((point, owner));
         }
-        for _ in 0..body.count_of(POINT_BYTES)? {
-            points.push([finite(body)?, finite(body)?, finite(body)?]);
-            point_motion.push(NOISE);
+        let count = body.count_of(POINT_BYTES)?;
+        let mut standing: Vec<Point> = Vec::with_capacity(count);
+        for _ in 0..count {
+            standing.push([finite(body)?, finite(body)?, finite(body)?]);
         }
-        Ok(Self::new(motions, &points, &point_motion))
+        Ok(Self::of(motions, &moving, &standing))
     }
 }
 

@@ -91,7 +91,7 @@ impl Objects {
             objects.cluster[rows[i]] = cluster as i32;
             members[cluster as usize].push(i);
         }
-        // The first clusters hold most of the points, so that each is a task of its own.
+        // The first clusters hold most of the points, so each cluster is a task of its own.
         let described = motions.par_iter().zip(&members).with_max_len(1);
         let described = described.map(|(&motion, members)| {
             let points: Vec<Point> = members.iter().map(|&i| points[i]).collect();

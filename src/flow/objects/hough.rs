@@ -27,7 +27,7 @@ pub(super) struct TranslationVotes {
 }
 
 impl TranslationVotes {
-    /// For a target.
+    /// For translations to `target`.
     pub(super) fn new(target: &TargetCloud, options: &ObjectOptions) -> Self {
         let ObjectOptions {
             bin_m,
@@ -35,7 +35,10 @@ impl TranslationVotes {
             ..
         } = *options;
         let kept = voxel_first(&target.points, bin_m);
-        let points: Vec<Point> = kept.iter().map(|&row| target.points[row as usize]).collect();
+        let points: Vec<Point> = kept
+            .iter()
+            .map(|&row| target.points[row as usize])
+            .collect();
         Self {
             near: ColumnIndex::new(&points, max_displacement_m / 3.0),
             bin_m,
@@ -118,8 +121,6 @@ impl TranslationVotes {
 mod tests {
     use super::*;
     use crate::flow::data::Random;
-    use crate::flow::objects::clouds::{SourceCloud, TargetCloud};
-    use crate::flow::spatial::NOISE;
 
     #[test]
     fn the_first_peak_is_the_shift_of_the_points_and_the_others_lie_apart() {

@@ -30,36 +30,42 @@ pub struct ObjectMotions {
 impl ObjectMotions {
     /// No motion.
     pub(super) fn none() -> Self {
-        Self::new(Vec::new(), &[], &[])
+        Self::of(Vec::new(), &[], &[])
     }
 
     /// From N `points`, metres in the target's frame with the ego motion taken out, and the index
-    /// into `motions` of each; [`NOISE`] is static.
+    /// into `motions` of each; [`NOISE`] is static. Computes in parallel.
     pub(super) fn new(motions: Vec<PlanarMotion>, points: &[Point], point_motion: &[u32]) -> Self {
-        let of = |moves: bool| {
-            let chosen = points.iter().zip(point_motion);
-            chosen.filter(move |&(_, &owner)| (owner != NOISE) == moves)
-        };
-        let moving: Vec<Point> = of(true).map(|(&point, _)| point).collect();
-        let arrived: Vec<Point> = of(true)
-            .map(|(&point, &owner)| motions[owner as usize].apply(point))
-            .collect();
-        let both = [moving.as_slice(), &arrived].concat();
-        let (moving, both) = rayon::join(
-            || ColumnIndex::new(&moving, 2.0 * REACH_M),
-            || ColumnIndex::new(&both, 2.0 * REACH_M),
-        );
+        let owned = points.iter().copied().zip(point_motion.iter().copied());
+        let moving: Vec<(Point, u32)> = owned.filter(|&(_, owner)| owner != NOISE).collect();
+        let before = moving.iter().map(|&(point, _)| point);
+        let after = moving
+            .iter()
+            .map(|&(point, owner)| motions[owner as usize].apply(point));
+        let both: Vec<Point> = before.chain(after).collect();
+        let both = ColumnIndex::new(&both, 2.0 * REACH_M);
         // A static point farther from all moving points, before and after their motion, is never the
         // nearest to a position that may move.
         let matters = |point: Point| both.nearest(point, 2.0 * REACH_M).is_some();
         let rows = points.par_iter().zip(point_motion);
         let standing = rows.filter(|&(&point, &owner)| owner == NOISE && matters(point));
         let standing: Vec<Point> = standing.map(|(&point, _)| point).collect();
+        Self::of(motions, &moving, &standing)
+    }
+
+    /// From the motions, the moving points with the index of each one's motion, and the static points
+    /// beside them.
+    pub(super) fn of(
+        motions: Vec<PlanarMotion>,
+        moving: &[(Point, u32)],
+        standing: &[Point],
+    ) -> Self {
+        let (moving, point_motion): (Vec<Point>, Vec<u32>) = moving.iter().copied().unzip();
         Self {
             motions,
-            point_motion: of(true).map(|(_, &owner)| owner).collect(),
-            moving,
-            standing: ColumnIndex::new(&standing, REACH_M),
+            point_motion,
+            moving: ColumnIndex::new(&moving, 2.0 * REACH_M),
+            standing: ColumnIndex::new(standing, REACH_M),
         }
     }
 
@@ -68,12 +74,10 @@ impl ObjectMotions {
         let (motions, moving, standing) = self.parts();
         let arrived = moving
             .iter()
-            .map(|&(point, owner)| motions[owner as usize].apply(point));
-        let points: Vec<Point> = arrived.chain(standing.iter().copied()).collect();
-        let owners = moving.iter().map(|&(_, owner)| owner);
-        let owners: Vec<u32> = owners.chain(standing.iter().map(|_| NOISE)).collect();
+            .map(|&(point, owner)| (motions[owner as usize].apply(point), owner));
+        let arrived: Vec<(Point, u32)> = arrived.collect();
         let back = motions.iter().map(|motion| motion.repeated(-1));
-        Self::new(back.collect(), &points, &owners)
+        Self::of(back.collect(), &arrived, &standing)
     }
 
     /// The motions, the moving points with the index of each one's motion, and the static points

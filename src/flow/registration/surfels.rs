@@ -1,7 +1,7 @@
 //! Surfels: small flat patches of a cloud's surfaces, and a nearest-neighbor search over them.
 //!
-//! A surfel is fitted to the neighbors of a point within a radius when it is asked for first: most
-//! points of a target are matched by none of the source points that are registered.
+//! A surfel is fitted to the neighbors of a point within a radius. It is fitted when it is first asked
+//! for, because the source points that are registered match few of a target's points.
 
 use std::sync::OnceLock;
 
@@ -9,9 +9,6 @@ use rayon::prelude::*;
 
 use crate::flow::data::{Point, get_or_compute, stride_sample};
 use crate::flow::spatial::{ColumnIndex, Neighborhood, PlaneFit};
-
-/// The plane at each point of a cloud, once it is fitted; none where the surface is not flat.
-type Planes = Vec<OnceLock<Option<PlaneFit>>>;
 
 /// Bound on the points of a column of the index.
 const MOST_IN_A_COLUMN: usize = 4096;
@@ -35,7 +32,8 @@ pub(super) struct Surfels {
     /// The points in the order of the index.
     points: Vec<Point>,
     index: ColumnIndex,
-    flats: Planes,
+    /// The plane at each point, once it is fitted; none where the surface is not flat.
+    flats: Vec<OnceLock<Option<PlaneFit>>>,
 }
 
 impl Surfels {

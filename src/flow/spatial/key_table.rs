@@ -64,7 +64,7 @@ impl<V: Copy + Default> KeyTable<V> {
         &mut self.slots[slot].1
     }
 
-    /// Whether the key is new. It is not from now on.
+    /// Adds a key, and returns whether it was new.
     #[inline]
     pub(super) fn insert(&mut self, key: u64) -> bool {
         let before = self.used;
