@@ -24,7 +24,7 @@ const ALIGNING: f64 = 4e9;
 /// Cost per point of the registration's voxel downsampling and surfels, multiply-adds.
 const THINNING: f64 = 2e4;
 /// Peak bytes per point of the same step: the point, a cached copy, its voxel and its surfels.
-const THINNING_BYTES: usize = 112;
+const THINNING_BYTES: usize = 96;
 /// Peak bytes per point of either cloud where nothing is registered: the ground, the clouds without
 /// it, and the indices by which their overlap is measured.
 const OVERLAP_BYTES: usize = 96;
