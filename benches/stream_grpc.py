@@ -127,12 +127,12 @@ def report(
         if rows == pair.header.points:
             latencies.append((time.monotonic() - sent[pair.index + 1]) * 1e3)
             waited = max(waited, len(sent) - pair.index - 2)
+    if len(latencies) != asked.sweeps - 1:
+        sys.exit(f"{len(latencies)} flows of {asked.sweeps} sweeps")
     server_ms, client_ms = (
         (after - before) * 1e3 / len(latencies)
         for before, after in zip(used, [cpu_seconds(server.pid), time.process_time()])
     )
-    if len(latencies) != asked.sweeps - 1:
-        sys.exit(f"{len(latencies)} flows of {asked.sweeps} sweeps")
     print(
         f"{len(latencies)} flows at {asked.hz:g} Hz: latency median {median(latencies):.0f} ms, "
         f"99% {sorted(latencies)[int(0.99 * (len(latencies) - 1))]:.0f} ms, most {max(latencies):.0f} ms; "
