@@ -89,7 +89,8 @@ impl Gpu {
     }
 
     /// Destroys the device for all clones and frees its memory. All work on it fails with
-    /// [`BackendError::Lost`] from then on.
+    /// [`BackendError::Lost`] from then on. It waits for the threads that wait for the GPU: for one
+    /// that hangs, up to twice the longest time without an answer.
     pub fn destroy(&self) {
         let context = &self.0.context;
         context.watchdog.lost("it was given up".to_owned());

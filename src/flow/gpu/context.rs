@@ -20,12 +20,6 @@ use crate::flow::field::{BackendError, Parameters};
 const LONGEST_SILENCE: Duration = Duration::from_secs(20);
 /// The same limit for a software device, whose speed depends on the load of the machine.
 const SOFTWARE_SILENCE: Duration = Duration::from_secs(120);
-/// Interval at which a thread that waits for the GPU checks whether it is lost. It is long on
-/// purpose: a wait that times out while another thread finds the queue empty trips an assertion of
-/// wgpu 30 (gfx-rs/wgpu#9958), which loses the device.
-const POLL_INTERVAL: Duration = Duration::from_secs(2);
-/// The same on a software device, which takes seconds for a submission on a busy machine.
-const SOFTWARE_POLL_INTERVAL: Duration = Duration::from_secs(10);
 /// Distances that are computed in one submission to the driver: 7 s at 1e10 a second.
 const MOST_DISTANCES: usize = 1 << 36;
 /// The same on a software device: 17 s at 1e9 a second.
@@ -48,7 +42,6 @@ pub(super) struct Context {
     pub(super) tile: Result<Tile, String>,
     networks: Mutex<Vec<u32>>,
     longest_silence: Duration,
-    poll_interval: Duration,
     /// Distances that are computed in one submission to the driver.
     pub(super) most_distances: usize,
 }
@@ -102,10 +95,6 @@ impl Context {
             longest_silence: match adapter.kind {
                 AdapterKind::Software => SOFTWARE_SILENCE,
                 _ => LONGEST_SILENCE,
-            },
-            poll_interval: match adapter.kind {
-                AdapterKind::Software => SOFTWARE_POLL_INTERVAL,
-                _ => POLL_INTERVAL,
             },
             tile,
             device,
@@ -289,27 +278,25 @@ impl Context {
         self.wait(&submission)
     }
 
-    /// Waits for a submission.
+    /// Waits for a submission. A loss that another thread finds is noticed when the wait ends.
     ///
     /// # Errors
     /// [`BackendError::Lost`] if the GPU does not answer.
     pub(super) fn wait(&self, submission: &wgpu::SubmissionIndex) -> Result<(), BackendError> {
-        let mut waited = Duration::ZERO;
-        loop {
-            self.watchdog.check()?;
-            let wait = wgpu::PollType::Wait {
-                submission_index: Some(submission.clone()),
-                timeout: Some(self.poll_interval),
-            };
-            match self.device.poll(wait) {
-                Ok(_) => break,
-                Err(wgpu::PollError::Timeout) => waited += self.poll_interval,
-                Err(error) => return Err(BackendError::Device(error.to_string())),
-            }
-            if waited > self.longest_silence {
-                let seconds = waited.as_secs();
+        self.watchdog.check()?;
+        // Not in shorter waits: wgpu 30 panics if one times out while another thread finds the queue
+        // empty (gfx-rs/wgpu#9958).
+        let wait = wgpu::PollType::Wait {
+            submission_index: Some(submission.clone()),
+            timeout: Some(self.longest_silence),
+        };
+        match self.device.poll(wait) {
+            Ok(_) => {}
+            Err(wgpu::PollError::Timeout) => {
+                let seconds = self.longest_silence.as_secs();
                 self.watchdog.lost(format!("no answer for {seconds} s"));
             }
+            Err(error) => return Err(BackendError::Device(error.to_string())),
         }
         self.watchdog.check()
     }
