@@ -4,6 +4,24 @@ use std::net::TcpListener;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
+/// Runs moto on the port given as the argument. Moto's `put_object` checks `If-None-Match` and
+/// writes in two steps, so that two clients can both create one object. S3 does both in one step.
+/// The lock makes moto do the same.
+const MOTO: &str = "
+import sys, threading
+from moto.s3.responses import S3Response
+from moto.server import main
+
+lock, put_object = threading.Lock(), S3Response.put_object
+
+def one_at_a_time(self):
+    with lock:
+        return put_object(self)
+
+S3Response.put_object = one_at_a_time
+main(['-H', '127.0.0.1', '-p', sys.argv[1]])
+";
+
 /// A running object store with one empty bucket, `farm`. It is killed on drop.
 pub(crate) struct ObjectServer {
     child: Child,
@@ -32,14 +50,7 @@ impl ObjectServer {
         let port = free.local_addr().expect("an address").port();
         drop(free);
         let child = Command::new("python3")
-            .args([
-                "-m",
-                "moto.server",
-                "-H",
-                "127.0.0.1",
-                "-p",
-                &port.to_string(),
-            ])
+            .args(["-c", MOTO, &port.to_string()])
             .stdout(Stdio::null())
             .stderr(Stdio::null())
             .spawn()
