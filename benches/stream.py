@@ -15,9 +15,20 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from statistics import median
 from typing import Any
+
+
+def stream_parser(description: str | None) -> argparse.ArgumentParser:
+    """The options of a stream of sweeps."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("files", nargs="+", type=Path, metavar="SWEEP")
+    parser.add_argument("--fnsf", default="fnsf")
+    parser.add_argument("--sweeps", type=int, default=300)
+    parser.add_argument("--hz", type=float, default=10.0)
+    return parser
 
 
 def parsed(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
@@ -25,25 +36,28 @@ def parsed(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
     if "--" in arguments:
         at = arguments.index("--")
         arguments, more = arguments[:at], arguments[at + 1 :]
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("files", nargs="+", type=Path, metavar="SWEEP")
-    parser.add_argument("--fnsf", default="fnsf")
-    parser.add_argument("--sweeps", type=int, default=300)
-    parser.add_argument("--hz", type=float, default=10.0)
+    parser = stream_parser(__doc__)
     parser.add_argument("--svg", type=Path)
     return parser.parse_args(arguments), more
 
 
+def at_rate(sweeps: list[bytes], asked: argparse.Namespace) -> Iterator[tuple[int, bytes, float]]:
+    """Numbered sweeps at their times, forward and backward, and by how many seconds each was asked for too late."""
+    there_and_back = itertools.cycle(sweeps + sweeps[-2:0:-1])
+    began = time.monotonic()
+    for number, sweep in zip(range(asked.sweeps), there_and_back):
+        left = began + number / asked.hz - time.monotonic()
+        time.sleep(max(left, 0.0))
+        yield number, sweep, max(-left, 0.0)
+
+
 def play(sweeps: list[bytes], ending: str, folder: Path, asked: argparse.Namespace) -> float:
     """Writes the sweeps, and returns by how many seconds the player itself was late at most."""
-    there_and_back = itertools.cycle(sweeps + sweeps[-2:0:-1])
-    began, late = time.time(), 0.0
-    for number, sweep in zip(range(asked.sweeps), there_and_back):
-        left = began + number / asked.hz - time.time()
-        time.sleep(max(left, 0.0))
-        late = max(late, -left)
+    most = 0.0
+    for number, sweep, late in at_rate(sweeps, asked):
+        most = max(most, late)
         (folder / f"{number:06}{ending}").write_bytes(sweep)
-    return late
+    return most
 
 
 def watch(process: subprocess.Popen[Any], resident: list[float]) -> None:
@@ -53,6 +67,16 @@ def watch(process: subprocess.Popen[Any], resident: list[float]) -> None:
         lines = status.read_text().splitlines() if status.exists() else []
         resident += [int(line.split()[1]) / 1e3 for line in lines if line.startswith("VmRSS")]
         time.sleep(0.5)
+
+
+def summary(asked: argparse.Namespace, latencies: list[float], waited: int, resident: list[float]) -> str:
+    """Latencies in ms and memory in MB, as text."""
+    return (
+        f"{len(latencies)} flows at {asked.hz:g} Hz: latency median {median(latencies):.0f} ms, "
+        f"99% {sorted(latencies)[int(0.99 * (len(latencies) - 1))]:.0f} ms, most {max(latencies):.0f} ms; "
+        f"at most {waited} sweeps waited; "
+        f"memory {resident[len(resident) // 4]:.0f} MB after a quarter, {resident[-1]:.0f} MB at the end"
+    )
 
 
 def panel(values: list[float], top: int, title: str, unit: str) -> str:
@@ -99,11 +123,9 @@ def main() -> None:
             sys.exit(f"fnsf ended with {process.returncode}")
     latencies = [report["latency_s"] * 1e3 for report in reports]
     ends = sorted({report["stop_reason"] for report in reports})
+    waited = max(report["waiting"] for report in reports)
     print(
-        f"{len(reports)} flows at {asked.hz:g} Hz: latency median {median(latencies):.0f} ms, "
-        f"99% {sorted(latencies)[int(0.99 * (len(latencies) - 1))]:.0f} ms, most {max(latencies):.0f} ms; "
-        f"at most {max(report['waiting'] for report in reports)} sweeps waited; ends: {', '.join(ends)}; "
-        f"memory {resident[len(resident) // 4]:.0f} MB after a quarter, {resident[-1]:.0f} MB at the end; "
+        f"{summary(asked, latencies, waited, resident)}; ends: {', '.join(ends)}; "
         f"the player was late by {player_late[0] * 1e3:.1f} ms at most"
     )
     if asked.svg:

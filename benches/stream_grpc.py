@@ -8,7 +8,6 @@ server is started for the run, on the same machine, with its own folder. Needs `
 """
 
 import argparse
-import itertools
 import os
 import subprocess
 import sys
@@ -19,13 +18,12 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import grpc
 import grpc_tools
 from grpc_tools import protoc
-from stream import watch
+from stream import at_rate, stream_parser, summary, watch
 
 PROTO = Path(__file__).resolve().parent.parent / "proto"
 LISTEN, ADMIN = "127.0.0.1:18080", "127.0.0.1:19090"
@@ -76,12 +74,7 @@ def cpu_seconds(pid: int) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("files", nargs="+", type=Path, metavar="SWEEP")
-    parser.add_argument("--fnsf", default="fnsf")
-    parser.add_argument("--sweeps", type=int, default=300)
-    parser.add_argument("--hz", type=float, default=10.0)
-    asked = parser.parse_args()
+    asked = stream_parser(__doc__).parse_args()
     sweeps = [read(path) for path in asked.files]
     with tempfile.TemporaryDirectory() as folder:
         messages, service = generated(folder)
@@ -105,9 +98,7 @@ def report(
 
     def requests() -> Iterator[Any]:
         yield request(begin=request.Begin())
-        began = time.monotonic()
-        for number, sweep in zip(range(asked.sweeps), itertools.cycle(sweeps + sweeps[-2:0:-1])):
-            time.sleep(max(began + number / asked.hz - time.monotonic(), 0.0))
+        for number, sweep, _ in at_rate(sweeps, asked):
             yield request(sweep=request.Sweep(name=str(number), points=len(sweep) // POINT))
             for first in range(0, len(sweep), CHUNK):
                 yield request(chunk=messages.Chunk(points=sweep[first : first + CHUNK]))
@@ -134,10 +125,8 @@ def report(
         for before, after in zip(used, [cpu_seconds(server.pid), time.process_time()])
     )
     print(
-        f"{len(latencies)} flows at {asked.hz:g} Hz: latency median {median(latencies):.0f} ms, "
-        f"99% {sorted(latencies)[int(0.99 * (len(latencies) - 1))]:.0f} ms, most {max(latencies):.0f} ms; "
-        f"at most {waited} sweeps waited; memory {resident[len(resident) // 4]:.0f} MB after a quarter, "
-        f"{resident[-1]:.0f} MB at the end; CPU time of a pair: server {server_ms:.0f} ms, client {client_ms:.0f} ms"
+        f"{summary(asked, latencies, waited, resident)}; "
+        f"CPU time of a pair: server {server_ms:.0f} ms, client {client_ms:.0f} ms"
     )
 
 
