@@ -234,7 +234,7 @@ fn on_lanes(adapter: &Adapter) -> Result<(), String> {
     let opened = [0, usize::MAX].map(|cluster_threads| {
         let options = GpuOptions {
             lanes: COUNTS[2],
-            cluster_threads,
+            cluster_threads: Some(cluster_threads),
             ..GpuOptions::default()
         };
         Gpu::open(adapter, &options).map_err(|e| e.to_string())

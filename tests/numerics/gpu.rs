@@ -1,8 +1,9 @@
 //! Tests of a GPU on a real pair, compared with the CPU. They need a GPU; a software one suffices.
 
-use fnsf::flow::Preset;
 use fnsf::flow::cpu::{CpuBackend, Isa};
+use fnsf::flow::field::Backend;
 use fnsf::flow::gpu::{Gpu, GpuOptions, adapters};
+use fnsf::flow::{Estimate, ObjectSolution, Preset, Problem, Solution, Uncontrolled, estimate};
 
 use super::gpu_rule;
 use super::scenes::{estimated_on, real_pair, scored};
@@ -35,4 +36,51 @@ fn a_card_gives_the_cpus_flow_on_argoverse_2_bit_by_bit() {
     options.field_mut().expect("a field").max_iterations = 10;
     let [first, second] = [(), ()].map(|()| estimated_on(&gpu, &pair, &options).flow);
     assert!(first == second);
+}
+
+/// The solution of an estimate by an object search.
+fn found(estimate: &Estimate) -> Option<&ObjectSolution> {
+    match &estimate.solution {
+        Solution::Objects(solution) => Some(solution),
+        Solution::Field(_) => None,
+    }
+}
+
+#[test]
+fn a_card_finds_the_cpus_objects_in_whole_real_sweeps() {
+    /// Largest difference of two flows, metres, and least share of points with the same bits: sines,
+    /// cosines and sums of a GPU round differently.
+    const ALIKE_M: f32 = 1e-4;
+    const SAME: f64 = 0.98;
+    let cards = adapters();
+    if !gpu_rule::is_there(cards.len()) {
+        return;
+    }
+    let options = GpuOptions {
+        cluster_threads: Some(usize::MAX),
+        ..GpuOptions::default()
+    };
+    let gpu = Gpu::open(&cards[0], &options).expect("the card opens");
+    let cpu = CpuBackend::new(Some(2)).expect("threads");
+    for name in ["av2_7fab", "kitti_0000", "small_gicp"] {
+        let Some(pair) = real_pair(name) else {
+            return;
+        };
+        let problem = Problem::pair(&pair.source, &pair.target);
+        let options = Preset::Default.options(None);
+        let [card, host] = [&gpu as &dyn Backend, &cpu]
+            .map(|backend| estimate(backend, &problem, &options, &Uncontrolled).expect("a flow"));
+        assert_eq!(card.device, gpu.name());
+        let [on_card, on_host] = [&card, &host].map(|estimate| found(estimate).expect("objects"));
+        assert!(on_card.searched > 100, "{name}");
+        assert_eq!(on_card.searched, on_host.searched, "{name}");
+        assert_eq!(on_card.objects.cluster, on_host.objects.cluster, "{name}");
+        assert_eq!(card.valid, host.valid, "{name}");
+        let away = card.flow.iter().flatten().zip(host.flow.iter().flatten());
+        let most_m = away.fold(0.0, |most, (a, b)| f32::max(most, (a - b).abs()));
+        assert!(most_m < ALIKE_M, "{name}: {most_m} m");
+        let same = card.flow.iter().zip(&host.flow).filter(|(a, b)| a == b);
+        let share = same.count() as f64 / host.flow.len() as f64;
+        assert!(share > SAME, "{name}: {share}");
+    }
 }

@@ -79,8 +79,8 @@ impl Device {
         let threads = host.threads().current_num_threads();
         let lanes = context.budget.lanes as usize;
         Ok(Self {
-            searches_clusters: adapter.kind != AdapterKind::Software
-                && threads <= options.cluster_threads.saturating_mul(lanes),
+            searches_clusters: threads
+                <= options.cluster_threads(adapter.kind).saturating_mul(lanes),
             context: Arc::new(context),
             batch: Arc::default(),
             host,

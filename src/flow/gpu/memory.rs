@@ -23,8 +23,19 @@ pub struct GpuOptions {
     pub host_threads: Option<usize>,
     /// Threads of the host for each lane, up to which the GPU and not the host searches the clusters of
     /// an object search. All lanes do the same, so that a flow does not depend on how many are at work.
-    /// A software device never does it.
-    pub cluster_threads: usize,
+    /// None stands for four, and for zero on a software device.
+    pub cluster_threads: Option<usize>,
+}
+
+impl GpuOptions {
+    /// [`Self::cluster_threads`] on a device of this kind.
+    pub(super) fn cluster_threads(&self, kind: AdapterKind) -> usize {
+        self.cluster_threads.unwrap_or(match kind {
+            AdapterKind::Software => 0,
+            // An H200 takes half of the time of four threads, and as long as eight.
+            _ => 4,
+        })
+    }
 }
 
 impl Default for GpuOptions {
@@ -33,8 +44,7 @@ impl Default for GpuOptions {
             lanes: 1,
             memory_bytes: None,
             host_threads: None,
-            // On an H200 the GPU takes half of the time of four threads, and as long as eight.
-            cluster_threads: 4,
+            cluster_threads: None,
         }
     }
 }

@@ -62,6 +62,7 @@ pub(crate) struct SceneRecord {
     pub(crate) static_fit_m: f32,
     pub(crate) min_motion_m: f32,
     pub(crate) min_gain_m: f32,
+    pub(crate) max_cost_ratio: f32,
     pub(crate) min_evidence_m: f32,
     pub(crate) min_evidence_slope: f32,
     pub(crate) max_residual_m: f32,
@@ -253,6 +254,7 @@ fn scene_record(options: &ObjectOptions, votes: &TranslationVotes) -> SceneRecor
         static_fit_m: options.static_fit_m,
         min_motion_m: options.min_motion_m,
         min_gain_m: options.min_gain_m,
+        max_cost_ratio: options.max_cost_ratio,
         min_evidence_m: options.min_evidence_m,
         min_evidence_slope: options.min_evidence_slope,
         max_residual_m: options.max_residual_m,
@@ -312,6 +314,7 @@ pub(crate) fn shared_constants() -> Vec<(&'static str, f32)> {
         ("SHIFT_SIZES", sizes.len() as f32),
         ("LEFT_BY_FIT", left_by_fit),
         ("LEFT_BY_SEARCH", left_by_search),
+        ("TOO_COSTLY", hypothesis::TOO_COSTLY),
         (
             "STEPS_BETWEEN_LOOKS",
             gauss_newton::STEPS_BETWEEN_LOOKS as f32,

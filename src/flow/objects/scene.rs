@@ -9,7 +9,7 @@ use super::clouds::{SourceCloud, TargetCloud, column_m, lowered};
 use super::planar_motion::PlanarMotion;
 use crate::flow::data::Point;
 use crate::flow::options::ObjectOptions;
-use crate::flow::spatial::{ColumnIndex, Marks, NOISE, SlotLabels};
+use crate::flow::spatial::{ColumnIndex, NOISE, SlotLabels};
 
 /// Share of a cluster's points that must lie on the target for the cluster to be clearly static.
 const PLAIN: f32 = 0.9;
@@ -147,18 +147,11 @@ impl<'a> Scene<'a> {
             .iter()
             .map(|&row| map.apply(self.source.points[row as usize]));
         let moved: Vec<Point> = moved.map(|point| lowered(point, self.options)).collect();
-        let marked = |index: &ColumnIndex| {
-            let mut marks = Marks::of(index);
-            for &position in &moved {
-                index.mark_within(position, within_m, &mut marks);
-            }
-            marks
-        };
-        let mut touched: Vec<u32> = marked(&self.free).slots().collect();
+        let mut touched = self.free.slots_near(&moved, within_m);
         if self.has_static_matches(cluster) {
             let first = self.free.len() as u32;
-            let taken = marked(&self.taken);
-            let own = taken.slots().filter(|&slot| self.owners.is(slot, cluster));
+            let taken = self.taken.slots_near(&moved, within_m).into_iter();
+            let own = taken.filter(|&slot| self.owners.is(slot, cluster));
             touched.extend(own.map(|slot| first + slot));
         }
         touched

@@ -3,12 +3,16 @@
 //! Points are sorted into square vertical columns. A query visits the columns that its radius
 //! touches, a vector register of points at a time.
 
+use std::ops::Range;
+
 use super::column_kernels::{Wanted, each_level, each_near, nearest};
 use super::slots::{MOST_LANES, Slots, padded};
 use super::tiles::Tiles;
 use crate::flow::data::{Point, stride_sample};
 use crate::flow::simd::Isa;
 
+/// Side of the square within which centers are searched around together, in columns.
+const TOGETHER: f32 = 5.0;
 /// Factor on a radius that covers its rounding.
 const ROUNDED_UP: f32 = 1.0 + 4.0 * f32::EPSILON;
 
@@ -98,7 +102,7 @@ impl ColumnIndex {
     /// metres from `center`.
     #[inline]
     pub(crate) fn within(&self, center: Point, within_m: f32, mut see: impl FnMut(u32, Point)) {
-        each_near(self.isa, &self.slots, center, within_m, |first, bits| {
+        each_near(self.isa, &self.slots, &[center], within_m, |first, bits| {
             for bit in ones(bits.into()) {
                 let slot = first + bit as usize;
                 see(self.rows[slot], self.point(slot));
@@ -106,11 +110,17 @@ impl ColumnIndex {
         });
     }
 
-    /// Adds the slots of all points less than `within_m` metres from `center` to `marks`.
-    pub(crate) fn mark_within(&self, center: Point, within_m: f32, marks: &mut Marks) {
-        each_near(self.isa, &self.slots, center, within_m, |first, bits| {
-            marks.add(first, bits);
-        });
+    /// The slots of all points less than `within_m` metres from one of `centers`, in ascending order.
+    /// It is fast where centers that follow each other lie near each other.
+    pub(crate) fn slots_near(&self, centers: &[Point], within_m: f32) -> Vec<u32> {
+        let mut marks = Marks::of(self);
+        let side_m = TOGETHER * self.slots.tiles.column_m();
+        for together in within_squares(centers, side_m) {
+            each_near(self.isa, &self.slots, together, within_m, |first, bits| {
+                marks.add(first, bits);
+            });
+        }
+        marks.slots().collect()
     }
 
     /// Calls `see` with every point of the columns that touch the square of half side `half_m`
@@ -193,6 +203,25 @@ impl ColumnIndex {
     }
 }
 
+/// The `points` in parts: consecutive ones that lie within a square of side `side_m`, metres.
+fn within_squares(points: &[Point], side_m: f32) -> impl Iterator<Item = &[Point]> {
+    let mut rest = points;
+    std::iter::from_fn(move || {
+        let &[x, y, _] = rest.first()?;
+        let [mut low, mut high] = [[x, y]; 2];
+        let fits = |&&[x, y, _]: &&Point| {
+            low = [low[0].min(x), low[1].min(y)];
+            high = [high[0].max(x), high[1].max(y)];
+            high[0] - low[0] <= side_m && high[1] - low[1] <= side_m
+        };
+        // A point that is not finite fits nowhere.
+        let count = rest.iter().take_while(fits).count().max(1);
+        let (part, others) = rest.split_at(count);
+        rest = others;
+        Some(part)
+    })
+}
+
 /// One label a slot, for [`ColumnIndex::nearest_labelled`].
 #[derive(Debug)]
 pub(crate) struct SlotLabels(Vec<f32>);
@@ -226,26 +255,38 @@ fn label(label: u32) -> f32 {
 }
 
 /// A set of slots of a [`ColumnIndex`], one bit each.
-pub(crate) struct Marks(Vec<u64>);
+struct Marks {
+    words: Vec<u64>,
+    /// The words outside this range are zero.
+    used: Range<usize>,
+}
 
 impl Marks {
     /// The empty set of slots of an index.
-    pub(crate) fn of(index: &ColumnIndex) -> Self {
-        Self(vec![0; index.slots.padded().div_ceil(64)])
+    fn of(index: &ColumnIndex) -> Self {
+        let words = vec![0; index.slots.padded().div_ceil(64)];
+        let used = words.len()..0;
+        Self { words, used }
     }
 
     #[inline(always)]
     fn add(&mut self, first: usize, bits: u32) {
+        let Self { words, used } = self;
         let (word, shift) = (first / 64, first % 64);
-        self.0[word] |= u64::from(bits) << shift;
+        words[word] |= u64::from(bits) << shift;
+        let mut last = word;
         if shift > 64 - MOST_LANES {
-            self.0[word + 1] |= u64::from(bits) >> (64 - shift);
+            last += 1;
+            words[last] |= u64::from(bits) >> (64 - shift);
         }
+        *used = used.start.min(word)..used.end.max(last + 1);
     }
 
     /// The slots in ascending order.
-    pub(crate) fn slots(&self) -> impl Iterator<Item = u32> {
-        let words = self.0.iter().zip((0..).step_by(64));
+    fn slots(&self) -> impl Iterator<Item = u32> {
+        let Range { start, end } = self.used;
+        let words = self.words.get(start..end).unwrap_or_default().iter();
+        let words = words.zip((64 * start as u32..).step_by(64));
         words.flat_map(|(&word, first)| ones(word).map(move |bit| first + bit))
     }
 }

@@ -56,11 +56,11 @@ pub(super) fn nearest(
 }
 
 /// Calls `see` with a first slot and one bit for each of the slots from it on: whether the point of
-/// the slot is less than `within_m` metres from `center`.
+/// the slot is less than `within_m` metres from one of `centers`, which lie near each other.
 pub(super) fn each_near(
     isa: Isa,
     slots: &Slots,
-    center: Point,
+    centers: &[Point],
     within_m: f32,
     see: impl FnMut(usize, u32),
 ) {
@@ -68,10 +68,10 @@ pub(super) fn each_near(
     unsafe {
         match isa {
             #[cfg(target_arch = "x86_64")]
-            Isa::Avx512 => each_near_avx512(slots, center, within_m, see),
+            Isa::Avx512 => each_near_avx512(slots, centers, within_m, see),
             #[cfg(target_arch = "x86_64")]
-            Isa::Avx2 => each_near_avx2(slots, center, within_m, see),
-            _ => each_near_in::<F32x4>(slots, center, within_m, see),
+            Isa::Avx2 => each_near_avx2(slots, centers, within_m, see),
+            _ => each_near_in::<F32x4>(slots, centers, within_m, see),
         }
     }
 }
@@ -118,7 +118,7 @@ unsafe fn nearest_in<L: Lanes, const LABELLED: bool>(
         let (labels, label) = label.unwrap_or((&[], 0.0));
         let label = L::splat(label);
         let (mut least, mut first_slots) = (limit, L::splat(0.0));
-        slots.tiles.each_run(center, half_m, |run| {
+        slots.tiles.each_run(around(&[center], half_m), |run| {
             let mut first = run.start;
             while first < run.end {
                 let mut squares = squares_at::<L>(slots, center_lanes, first);
@@ -154,19 +154,25 @@ unsafe fn nearest_in<L: Lanes, const LABELLED: bool>(
 #[inline(always)]
 unsafe fn each_near_in<L: Lanes>(
     slots: &Slots,
-    center: Point,
+    centers: &[Point],
     within_m: f32,
     mut see: impl FnMut(usize, u32),
 ) {
     // SAFETY: as in `nearest_in`.
     unsafe {
-        let center_lanes = center.map(|c| L::splat(c));
         let limit = L::splat(within_m * within_m);
-        slots.tiles.each_run(center, within_m, |run| {
+        slots.tiles.each_run(around(centers, within_m), |run| {
             let mut first = run.start;
             while first < run.end {
-                let bits = squares_at::<L>(slots, center_lanes, first).less(limit);
-                let bits = bits & lowest(run.end - first);
+                let wanted = lowest(L::COUNT.min(run.end - first));
+                let mut bits = 0;
+                for center in centers {
+                    let center = center.map(|c| L::splat(c));
+                    bits |= squares_at::<L>(slots, center, first).less(limit) & wanted;
+                    if bits == wanted {
+                        break;
+                    }
+                }
                 if bits != 0 {
                     see(first, bits);
                 }
@@ -189,7 +195,7 @@ unsafe fn each_level_in<L: Lanes>(
     // SAFETY: as in `nearest_in`.
     unsafe {
         let [low, high] = [center[2] - height_m, center[2] + height_m].map(|z| L::splat(z));
-        slots.tiles.each_run(center, half_m, |run| {
+        slots.tiles.each_run(around(&[center], half_m), |run| {
             let mut first = run.start;
             while first < run.end {
                 let heights = L::load(slots.axes[2].as_ptr().add(first));
@@ -220,6 +226,19 @@ unsafe fn squares_at<L: Lanes>(slots: &Slots, center: [L; 3], first: usize) -> L
     }
 }
 
+/// The corners of the rectangle that reaches `within_m` beyond all of `centers`, along x and y.
+#[inline(always)]
+fn around(centers: &[Point], within_m: f32) -> [[f32; 2]; 2] {
+    let mut corners = [[f32::INFINITY; 2], [f32::NEG_INFINITY; 2]];
+    for center in centers {
+        for axis in 0..2 {
+            corners[0][axis] = corners[0][axis].min(center[axis] - within_m);
+            corners[1][axis] = corners[1][axis].max(center[axis] + within_m);
+        }
+    }
+    corners
+}
+
 /// The lowest `count` bits.
 #[inline(always)]
 fn lowest(count: usize) -> u32 {
@@ -242,12 +261,12 @@ macro_rules! compiled {
         #[target_feature(enable = $features)]
         unsafe fn $each_near(
             slots: &Slots,
-            center: Point,
+            centers: &[Point],
             within_m: f32,
             see: impl FnMut(usize, u32),
         ) {
             // SAFETY: the features are enabled.
-            unsafe { each_near_in::<$lanes>(slots, center, within_m, see) }
+            unsafe { each_near_in::<$lanes>(slots, centers, within_m, see) }
         }
         #[target_feature(enable = $features)]
         unsafe fn $each_level(

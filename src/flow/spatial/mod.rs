@@ -10,7 +10,7 @@ mod slots;
 mod tiles;
 mod voxel;
 
-pub(crate) use column_index::{ColumnIndex, Marks, SlotLabels};
+pub(crate) use column_index::{ColumnIndex, SlotLabels};
 pub(crate) use dbscan::NOISE;
 pub(crate) use index_words::IndexRecord;
 pub(crate) use plane::{Neighborhood, PlaneFit};

@@ -118,14 +118,11 @@ impl Tiles {
     }
 
     /// Calls `see` with ranges of points that together are all points of the columns that touch the
-    /// square of half side `half_m` metres around `center`. The ranges ascend.
+    /// rectangle from `low` to `high`, metres along x and y. The ranges ascend.
     #[inline(always)]
-    pub(super) fn each_run(&self, center: Point, half_m: f32, mut see: impl FnMut(Range<usize>)) {
-        let corner = |side_m: f32| {
-            let [x, y, z] = center;
-            column_of([x + side_m, y + side_m, z], self.columns_per_m)
-        };
-        let ([left, low], [right, high]) = (corner(-half_m), corner(half_m));
+    pub(super) fn each_run(&self, [low, high]: [[f32; 2]; 2], mut see: impl FnMut(Range<usize>)) {
+        let column = |[x, y]: [f32; 2]| column_of([x, y, 0.0], self.columns_per_m);
+        let ([left, low], [right, high]) = (column(low), column(high));
         let (mut tile_x, last_x) = (left >> SIDE_BITS, right >> SIDE_BITS);
         // `while` compiles to less than `for` over an inclusive range.
         while tile_x <= last_x {

@@ -45,11 +45,13 @@ fn with_network_and_transform() -> impl Iterator<Item = Preset> {
     })
 }
 
-/// The GPU shared by the tests that leave it intact.
+/// The GPU shared by the tests that leave it intact. It searches clusters, also where it is a software
+/// device.
 fn shared() -> Option<&'static Gpu> {
     static SHARED: OnceLock<Option<Gpu>> = OnceLock::new();
     let options = GpuOptions {
         lanes: SHARED_LANES,
+        cluster_threads: Some(usize::MAX),
         ..GpuOptions::default()
     };
     SHARED.get_or_init(|| opened(&options)).as_ref()

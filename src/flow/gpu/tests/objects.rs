@@ -7,11 +7,8 @@ use super::whole::{end_point_error, solved};
 use crate::flow::cpu::CpuBackend;
 use crate::flow::data::{Control, Interrupt, Point, Uncontrolled};
 use crate::flow::estimate::{Estimate, Solution, estimate};
-use crate::flow::field::{Backend, BackendError, Network, PreparedTarget};
-use crate::flow::gpu::Gpu;
-use crate::flow::host::Host;
-use crate::flow::objects::{FoundRecord, PackedScene};
-use crate::flow::options::{Ground, LossOptions, Options, Preset};
+use crate::flow::field::Backend;
+use crate::flow::options::{Ground, Options, Preset};
 use crate::flow::problem::{NeighborSweep, Problem};
 use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
 
@@ -26,45 +23,6 @@ fn street(seed: u64) -> (Street, SimulatedPair) {
     let street = Street::new(&options).expect("a street");
     let pair = street.pair(1).expect("a pair");
     (street, pair)
-}
-
-/// A GPU that searches clusters although it is a software device.
-struct OnTheCard<'a>(&'a Gpu);
-
-impl Backend for OnTheCard<'_> {
-    fn name(&self) -> String {
-        self.0.name()
-    }
-
-    fn host(&self) -> &Host {
-        self.0.host()
-    }
-
-    fn searches_clusters(&self) -> bool {
-        true
-    }
-
-    fn search_clusters(
-        &self,
-        scene: &PackedScene,
-        is_over: &dyn Fn() -> bool,
-    ) -> Result<Vec<FoundRecord>, BackendError> {
-        self.0.search_clusters(scene, is_over)
-    }
-
-    fn prepare_target(
-        &self,
-        source: &[Point],
-        target: &[Point],
-        options: &LossOptions,
-        control: &dyn Control,
-    ) -> Result<Box<dyn PreparedTarget>, BackendError> {
-        self.0.prepare_target(source, target, options, control)
-    }
-
-    fn evaluate(&self, network: &Network, points: &[Point]) -> Result<Vec<Point>, BackendError> {
-        self.0.evaluate(network, points)
-    }
 }
 
 /// The share of the points whose flows differ by less than 2 cm.
@@ -88,7 +46,7 @@ fn searched(estimate: &Estimate) -> usize {
 #[test]
 fn a_card_finds_the_objects_that_the_host_finds() {
     const ALIKE: f64 = 0.99;
-    let Some(gpu) = shared().map(OnTheCard) else {
+    let Some(gpu) = shared() else {
         return;
     };
     let cpu = CpuBackend::new(Some(2)).expect("threads");
@@ -96,7 +54,7 @@ fn a_card_finds_the_objects_that_the_host_finds() {
         let (_, pair) = street(seed);
         let options = Preset::Default.options(None);
         let [card, host] =
-            [&gpu as &dyn Backend, &cpu].map(|backend| solved(backend, &pair, &options));
+            [gpu as &dyn Backend, &cpu].map(|backend| solved(backend, &pair, &options));
         assert_eq!(card.device, gpu.name());
         assert_eq!(searched(&card), searched(&host));
         assert!(searched(&card) > 20);
@@ -110,7 +68,7 @@ fn a_card_finds_the_objects_that_the_host_finds() {
 #[test]
 fn a_card_searches_neighbor_sweeps_as_the_host_does() {
     const ALIKE: f64 = 0.99;
-    let Some(gpu) = shared().map(OnTheCard) else {
+    let Some(gpu) = shared() else {
         return;
     };
     let cpu = CpuBackend::new(Some(2)).expect("threads");
@@ -130,7 +88,7 @@ fn a_card_searches_neighbor_sweeps_as_the_host_does() {
     let found = |backend: &dyn Backend| {
         estimate(backend, &problem, &options, &Uncontrolled).expect("a flow")
     };
-    let (card, host) = (found(&gpu), found(&cpu));
+    let (card, host) = (found(gpu), found(&cpu));
     assert_eq!(card.device, gpu.name());
     let alike = agreement(&card.flow, &host.flow);
     assert!(alike > ALIKE, "{alike}");
@@ -146,7 +104,7 @@ fn a_card_that_is_interrupted_leaves_the_clusters_at_rest() {
             late.then_some(Interrupt::Deadline)
         }
     }
-    let Some(gpu) = shared().map(OnTheCard) else {
+    let Some(gpu) = shared() else {
         return;
     };
     let (_, pair) = street(3);
@@ -158,7 +116,7 @@ fn a_card_that_is_interrupted_leaves_the_clusters_at_rest() {
     let mut last = 0;
     for looks in [0, 20, 10_000] {
         let control = After(looks, AtomicUsize::new(0));
-        let found = estimate(&gpu, &problem, &options, &control).expect("a flow");
+        let found = estimate(gpu, &problem, &options, &control).expect("a flow");
         assert!(searched(&found) >= last);
         last = searched(&found);
     }

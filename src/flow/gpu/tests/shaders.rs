@@ -111,7 +111,7 @@ fn host_and_cluster_kernel_agree_on_every_record() {
     same_cluster_layout!("Scene", SceneRecord: source, positions, rows, statics, static_words, voted, views,
         scratch_words, half_bins, bin_m, vote_within_m, cluster_min_points, initial_guesses,
         height_weight, match_m, tangential_weight, truncation_m, close_fit_m, displacement_penalty, static_fit_m,
-        min_motion_m, min_gain_m, min_evidence_m, min_evidence_slope, max_residual_m, min_normal_motion_m,
+        min_motion_m, min_gain_m, max_cost_ratio, min_evidence_m, min_evidence_slope, max_residual_m, min_normal_motion_m,
         neighbor_cost_ratio, neighbor_gain_m, slow_cost_ratio, slow_gain_m);
     same_cluster_layout!("Cluster", ClusterRecord: label, members, count, center_x, center_y);
     same_cluster_layout!("Found", FoundRecord: still_forward, still_backward, is_found, shift_x, shift_y, turn,

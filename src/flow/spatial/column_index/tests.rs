@@ -117,17 +117,16 @@ fn on_a_lattice_far_out_nothing_near_is_left_out_and_all_sets_find_the_same_of_e
 }
 
 #[test]
-fn what_lies_near_several_places_is_marked_once_and_nothing_of_it_is_left_out() {
-    let (cloud, places) = scattered(3000, 40, 3.0);
+fn what_lies_near_several_places_is_found_once_and_nothing_of_it_is_left_out() {
+    let (cloud, places) = scattered(3000, 20, 3.0);
+    // Some follow others that lie near them.
+    let beside = |&[x, y, z]: &Point| [[x, y, z], [x + 0.4, y, z], [x, y - 0.9, z + 0.2]];
+    let places: Vec<Point> = places.iter().flat_map(beside).collect();
     for index in on_all_sets(&cloud, 0.35) {
-        let mut marks = Marks::of(&index);
-        for &place in &places {
-            index.mark_within(place, 0.7, &mut marks);
-        }
-        let mut rows: Vec<u32> = marks
-            .slots()
-            .map(|slot| index.rows()[slot as usize])
-            .collect();
+        let slots = index.slots_near(&places, 0.7);
+        assert!(slots.is_sorted());
+        let rows = slots.iter().map(|&slot| index.rows()[slot as usize]);
+        let mut rows: Vec<u32> = rows.collect();
         rows.sort_unstable();
         let is_near = |point: &Point| places.iter().any(|&p| square_distance(p, *point) < 0.49);
         let expected = cloud.iter().zip(0..).filter(|(point, _)| is_near(point));

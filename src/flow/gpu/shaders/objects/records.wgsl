@@ -61,6 +61,7 @@ struct Scene {
     static_fit_m: f32,
     min_motion_m: f32,
     min_gain_m: f32,
+    max_cost_ratio: f32,
     min_evidence_m: f32,
     min_evidence_slope: f32,
     max_residual_m: f32,

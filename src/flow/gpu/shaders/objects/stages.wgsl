@@ -177,7 +177,9 @@ fn evaluated() {
             search.tries = 0u;
             search.direction = 0u;
             search.center = search.best;
-            if is_open(search.best, LEFT_BY_SEARCH * search.best_total) { ask_shift(); } else { ask_surfaces(); }
+            let most_m = TOO_COSTLY * scene.max_cost_ratio * search.at_rest_m;
+            let is_low = scene.views > 1u || search.best_total <= most_m;
+            if is_low && is_open(search.best, LEFT_BY_SEARCH * search.best_total) { ask_shift(); } else { ask_surfaces(); }
         }
         default: {
             consider(0.0);

@@ -27,6 +27,8 @@ const SHIFT_SIZES = 3u;
 // Least share of a cost that the last fit, and that the direct search after it, leave.
 const LEFT_BY_FIT = 0.5;
 const LEFT_BY_SEARCH = 0.6;
+// Cost after the last fit, over the largest that is accepted, above which there is no direct search.
+const TOO_COSTLY = 1.25;
 const TURNED = 40u;
 const SHORT_STEP_M = 1e-3;
 const LEAST_WEIGHT = 1e-6;
