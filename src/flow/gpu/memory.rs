@@ -32,7 +32,7 @@ impl GpuOptions {
     pub(super) fn cluster_threads(&self, kind: AdapterKind) -> usize {
         self.cluster_threads.unwrap_or(match kind {
             AdapterKind::Software => 0,
-            // An H200 takes half of the time of four threads, and as long as eight.
+            // Measured on an H200: half of the time of four threads, and that of eight.
             _ => 4,
         })
     }
@@ -155,6 +155,21 @@ impl Budget {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_software_device_searches_clusters_only_where_it_is_asked_to() {
+        let threads = |cluster_threads, kind| {
+            let options = GpuOptions {
+                cluster_threads,
+                ..GpuOptions::default()
+            };
+            options.cluster_threads(kind)
+        };
+        assert_eq!(threads(None, AdapterKind::Software), 0);
+        assert_eq!(threads(None, AdapterKind::Discrete), 4);
+        assert_eq!(threads(Some(8), AdapterKind::Software), 8);
+        assert_eq!(threads(Some(0), AdapterKind::Discrete), 0);
+    }
 
     #[test]
     fn a_small_card_of_its_own_holds_a_sweep_of_400_m() {

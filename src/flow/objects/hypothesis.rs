@@ -25,8 +25,8 @@ pub(super) const TRIES: usize = 4;
 /// Least share of a cost that the last fit, and that the direct search after it, leave. On real and
 /// simulated pairs they leave 0.64 and 0.73 of it or more.
 pub(super) const LEAST_LEFT: [f32; 2] = [0.5, 0.6];
-/// Cost after the last fit, over the largest cost that is accepted, above which the direct search is
-/// left out. On real and simulated pairs it leads no motion of more than 1.13 times that cost to it.
+/// Ratio of the cost after the last fit to the largest one that is accepted, above which the direct
+/// search is left out. On real and simulated pairs no motion with a ratio above 1.13 was accepted.
 pub(super) const TOO_COSTLY: f32 = 1.25;
 /// Distance by which they shorten a motion at most, metres, but for one in a hundred.
 pub(super) const SHORTENED_M: f32 = 0.25;
@@ -155,7 +155,8 @@ impl ClusterSearch<'_> {
             best = BestHypothesis::none();
             best.consider(self, motion, 0.0, None);
             let most_m = TOO_COSTLY * options.max_cost_ratio * at_rest_m;
-            // The acceptance test leaves out the neighbor sweeps that do not show the cluster.
+            // With neighbor sweeps the acceptance test compares other sums: those of the sweeps that
+            // show the cluster.
             let is_low = !self.neighbors.is_empty() || best.total_m <= most_m;
             is_left = is_low && is_open(&best.motion, after_search * best.total_m);
         }

@@ -11,7 +11,7 @@ use super::tiles::Tiles;
 use crate::flow::data::{Point, stride_sample};
 use crate::flow::simd::Isa;
 
-/// Side of the square within which centers are searched around together, in columns.
+/// Side of a square, in columns. Its centers share one search.
 const TOGETHER: f32 = 5.0;
 /// Factor on a radius that covers its rounding.
 const ROUNDED_UP: f32 = 1.0 + 4.0 * f32::EPSILON;
@@ -214,7 +214,7 @@ fn within_squares(points: &[Point], side_m: f32) -> impl Iterator<Item = &[Point
             high = [high[0].max(x), high[1].max(y)];
             high[0] - low[0] <= side_m && high[1] - low[1] <= side_m
         };
-        // A point that is not finite fits nowhere.
+        // A first point that is not finite does not even fit alone.
         let count = rest.iter().take_while(fits).count().max(1);
         let (part, others) = rest.split_at(count);
         rest = others;
@@ -265,6 +265,7 @@ impl Marks {
     /// The empty set of slots of an index.
     fn of(index: &ColumnIndex) -> Self {
         let words = vec![0; index.slots.padded().div_ceil(64)];
+        // The first slot sets both ends.
         let used = words.len()..0;
         Self { words, used }
     }

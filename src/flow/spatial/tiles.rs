@@ -41,7 +41,9 @@ impl Tiles {
     /// in the order of the columns; within a column they ascend.
     pub(super) fn new(points: &[Point], column_m: f32) -> (Self, Vec<u32>) {
         let columns_per_m = 1.0 / column_m;
-        let columns = points.iter().map(|&point| column_of(point, columns_per_m));
+        let columns = points
+            .iter()
+            .map(|&[x, y, _]| column_of([x, y], columns_per_m));
         let columns: Vec<[i32; 2]> = columns.collect();
         let mut table = KeyTable::<Tile>::new(0);
         // Points that follow each other often share a tile.
@@ -118,11 +120,11 @@ impl Tiles {
     }
 
     /// Calls `see` with ranges of points that together are all points of the columns that touch the
-    /// rectangle from `low` to `high`, metres along x and y. The ranges ascend.
+    /// rectangle between two corners, metres along x and y, the lower one first. The ranges ascend.
     #[inline(always)]
-    pub(super) fn each_run(&self, [low, high]: [[f32; 2]; 2], mut see: impl FnMut(Range<usize>)) {
-        let column = |[x, y]: [f32; 2]| column_of([x, y, 0.0], self.columns_per_m);
-        let ([left, low], [right, high]) = (column(low), column(high));
+    pub(super) fn each_run(&self, corners: [[f32; 2]; 2], mut see: impl FnMut(Range<usize>)) {
+        let [[left, low], [right, high]] =
+            corners.map(|corner| column_of(corner, self.columns_per_m));
         let (mut tile_x, last_x) = (left >> SIDE_BITS, right >> SIDE_BITS);
         // `while` compiles to less than `for` over an inclusive range.
         while tile_x <= last_x {
@@ -162,10 +164,10 @@ fn inside(low: i32, high: i32, tile: i32) -> (u32, u32) {
     )
 }
 
-/// Indices of the column that a point lies in. They grow with the coordinates, rounding included.
+/// Indices of the column that a place lies in, metres along x and y. They grow with the coordinates, rounding included.
 #[inline(always)]
-fn column_of([x, y, _]: Point, columns_per_m: f32) -> [i32; 2] {
-    [x, y].map(|c| {
+fn column_of(place: [f32; 2], columns_per_m: f32) -> [i32; 2] {
+    place.map(|c| {
         let columns = c * columns_per_m;
         let columns = if columns < REACH { columns } else { REACH };
         let columns = if columns > -REACH { columns } else { -REACH };
