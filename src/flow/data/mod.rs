@@ -34,6 +34,6 @@ pub(crate) use codec::{Body, Envelope, Hash};
 pub(crate) use largest::largest;
 pub(crate) use lazy::get_or_compute;
 pub(crate) use lock::locked;
-pub(crate) use point::{floor, square_distance, stride_sample, transform_point, transform_points};
+pub(crate) use point::{floors, square_distance, stride_sample, transform_point, transform_points};
 pub(crate) use rng::Random;
 pub(crate) use screw::Screw;

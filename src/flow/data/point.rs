@@ -25,19 +25,26 @@ pub(crate) fn square_distance(a: Point, b: Point) -> f32 {
     x * x + y * y + z * z
 }
 
-/// The largest integer that is not above `value`. Equal to [`f32::floor`] except for the sign of
-/// zero. On targets without a rounding instruction in their baseline, [`f32::floor`] is a function
-/// call.
-#[inline]
-pub(crate) fn floor(value: f32) -> f32 {
-    /// All numbers of at least this magnitude are integers.
-    const WHOLE: f32 = (1 << 23) as f32;
-    if value.abs() < WHOLE {
-        let toward_zero = value as i32 as f32;
-        toward_zero - f32::from(toward_zero > value)
-    } else {
-        value
+/// The largest integers that are not above `values`, within `limits`: the lower and the upper one, two
+/// integers between -2^31 and 2^31. NaN gives the upper limit.
+///
+/// A loop over an array, and a sum in place of a conversion, compile to vector instructions on all
+/// targets. [`f32::floor`] is a function call on targets without an instruction for it.
+#[inline(always)]
+pub(crate) fn floors<const N: usize>(values: [f32; N], limits: [f32; 2]) -> [i32; N] {
+    /// 1.5 times 2^52. Adding it rounds a number to an integer. The low 32 bits of the sum are that
+    /// integer.
+    const ROUNDING: f64 = (3_u64 << 51) as f64;
+    let [low, high] = limits;
+    let mut floors = [0; N];
+    for (floor, value) in floors.iter_mut().zip(values) {
+        let value = if value < high { value } else { high };
+        let value = f64::from(if value > low { value } else { low });
+        let sum = value + ROUNDING;
+        let is_above = sum - ROUNDING > value;
+        *floor = (sum.to_bits() as i32).wrapping_sub(i32::from(is_above));
     }
+    floors
 }
 
 /// At most `most` of the items, evenly spaced.
@@ -75,13 +82,17 @@ mod tests {
             1e30,
             f32::INFINITY,
         ];
+        let limits = [-(1 << 30) as f32, (1 << 30) as f32 - 64.0];
         for value in values
             .into_iter()
             .flat_map(|value| [value, -value, value + 0.25, -value - 0.25])
         {
-            assert_eq!(floor(value), value.floor(), "{value}");
+            let expected = value.floor().clamp(limits[0], limits[1]) as i32;
+            assert_eq!(floors([value], limits), [expected], "{value}");
         }
-        assert!(floor(f32::NAN).is_nan());
+        assert_eq!(floors([f32::NAN, 1.5, -1e-30], [-2.0, 7.0]), [7, 1, -1]);
+        let far = (1 << 30) as f32;
+        assert_eq!(floors([1e30, -1e30], [-far, far]), [1 << 30, -(1 << 30)]);
     }
 
     #[test]

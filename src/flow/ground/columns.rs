@@ -102,8 +102,8 @@ impl Columns {
         let cell = |point: &Point| {
             if reach(point) < half_m {
                 // Never negative, and a conversion to 32 bits takes one instruction.
-                let [u, v] = [0, 1].map(|axis| ((point[axis] + half_m) / SIDE_M) as u32 as usize);
-                v.min(side - 1) * side + u.min(side - 1)
+                let index = |c: f32| (((c + half_m) / SIDE_M) as u32 as usize).min(side - 1);
+                index(point[1]) * side + index(point[0])
             } else {
                 outside
             }

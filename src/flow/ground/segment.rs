@@ -75,10 +75,11 @@ pub fn segment(points: &[Point], options: &GroundOptions) -> GroundSegmentation 
         };
     }
     let is_ground = |point: &Point| {
-        let range = point[0].hypot(point[1]).min(GROWTH_M);
-        let tolerance = options.height_m + options.height_slope * range;
         let above = surface.above(point);
-        columns.contains(point) && -options.depth_m < above && above < tolerance
+        columns.contains(point) && -options.depth_m < above && {
+            let range = point[0].hypot(point[1]).min(GROWTH_M);
+            above < options.height_m + options.height_slope * range
+        }
     };
     GroundSegmentation {
         ground: points.iter().map(is_ground).collect(),

@@ -14,7 +14,10 @@ const ROUNDS: usize = 6;
 /// Heights over a square area centered on the origin.
 pub(super) struct HeightField {
     half_m: f32,
+    /// Distance between nodes, metres.
     step_m: f32,
+    /// Nodes per metre.
+    nodes_per_m: f32,
     /// Nodes along a side, at least 2.
     side: usize,
     /// Heights, metres, row by row; a row runs along x.
@@ -22,12 +25,14 @@ pub(super) struct HeightField {
 }
 
 impl HeightField {
-    /// A level surface over |x|, |y| <= `half_m` metres, which is a multiple of `step_m`.
+    /// A level surface over |x|, |y| <= `half_m` metres. `half_m` is a multiple of `step_m`, and
+    /// `step_m` is a power of two.
     pub(super) fn level(half_m: f32, step_m: f32, height_m: f32) -> Self {
         let side = (2.0 * half_m / step_m) as usize + 1;
         Self {
             half_m,
             step_m,
+            nodes_per_m: 1.0 / step_m,
             side,
             heights: vec![height_m; side * side],
         }
@@ -36,11 +41,24 @@ impl HeightField {
     /// The same surface with half the distance between nodes.
     pub(super) fn refined(&self) -> Self {
         let mut fine = Self::level(self.half_m, self.step_m / 2.0, 0.0);
-        let position = |node: usize| node as f32 * fine.step_m - fine.half_m;
-        for row in 0..fine.side {
-            for column in 0..fine.side {
-                fine.heights[row * fine.side + column] =
-                    self.height_at(position(column), position(row));
+        debug_assert_eq!(fine.side, 2 * self.side - 1);
+        let middle = |a: f32, b: f32| 0.5 * a + 0.5 * b;
+        let (coarse_side, side) = (self.side, fine.side);
+        let rows = fine.heights.chunks_exact_mut(side).step_by(2);
+        for (row, coarse) in rows.zip(self.heights.chunks_exact(coarse_side)) {
+            for (node, &height) in row.iter_mut().step_by(2).zip(coarse) {
+                *node = height;
+            }
+            for (node, ends) in row.iter_mut().skip(1).step_by(2).zip(coarse.windows(2)) {
+                *node = middle(ends[0], ends[1]);
+            }
+        }
+        for row in (1..side).step_by(2) {
+            let (before, rest) = fine.heights.split_at_mut(row * side);
+            let (nodes, after) = rest.split_at_mut(side);
+            let around = before[(row - 1) * side..].iter().zip(after.iter());
+            for (node, (&above, &below)) in nodes.iter_mut().zip(around) {
+                *node = middle(above, below);
             }
         }
         fine
@@ -52,9 +70,11 @@ impl HeightField {
     }
 
     /// Height at (x, y), metres; outside the area, the height at the nearest border point.
+    #[inline]
     pub(super) fn height_at(&self, x: f32, y: f32) -> f32 {
         let [u, v] = self.position(x, y);
-        let [column, row] = [u, v].map(|position| (position as u32 as usize).min(self.side - 2));
+        let before = |position: f32| (position as u32 as usize).min(self.side - 2);
+        let (column, row) = (before(u), before(v));
         let [along, across] = [u - column as f32, v - row as f32];
         let node = row * self.side + column;
         let between =
@@ -63,6 +83,7 @@ impl HeightField {
     }
 
     /// Height of a point above the surface, metres.
+    #[inline]
     pub(super) fn above(&self, point: &Point) -> f32 {
         point[2] - self.height_at(point[0], point[1])
     }
@@ -100,17 +121,20 @@ impl HeightField {
     }
 
     fn nearest(&self, point: &Point) -> usize {
-        let [column, row] = self
-            .position(point[0], point[1])
-            .map(|position| position.round() as u32 as usize);
-        row * self.side + column
+        let [u, v] = self.position(point[0], point[1]);
+        let rounded = |position: f32| {
+            let whole = position as u32;
+            whole as usize + usize::from(position - whole as f32 >= 0.5)
+        };
+        rounded(v) * self.side + rounded(u)
     }
 
     /// Position in node distances from the first node along x and y, clamped to the area. It is never
     /// negative, and a conversion to 32 bits takes one instruction.
     fn position(&self, x: f32, y: f32) -> [f32; 2] {
         let last = (self.side - 1) as f32;
-        [x, y].map(|value| ((value + self.half_m) / self.step_m).clamp(0.0, last))
+        let position = |c: f32| ((c + self.half_m) * self.nodes_per_m).clamp(0.0, last);
+        [position(x), position(y)]
     }
 }
 
@@ -172,6 +196,11 @@ mod tests {
         let fine = surface.refined().refined();
         for (x, y) in [(0.0, 0.0), (-31.0, 3.5), (13.2, 29.9), (32.0, -32.0)] {
             assert!((fine.height_at(x, y) - surface.height_at(x, y)).abs() < 1e-5);
+        }
+        let fine = surface.refined();
+        for (node, &height) in fine.heights.iter().enumerate() {
+            let [x, y] = [node % fine.side, node / fine.side].map(|n| n as f32 * 8.0 - 32.0);
+            assert_eq!(height, surface.height_at(x, y));
         }
     }
 

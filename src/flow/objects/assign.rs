@@ -12,7 +12,7 @@ use super::hypothesis::Hypothesis;
 use super::neighbor_view::NeighborView;
 use super::planar_motion::PlanarMotion;
 use super::scene::Scene;
-use crate::flow::data::stride_sample;
+use crate::flow::data::{Point, stride_sample};
 use crate::flow::spatial::NOISE;
 
 /// Points of a cluster from which moving objects beside it are searched.
@@ -38,9 +38,10 @@ pub(super) fn spread(
     neighbors: &[NeighborView<'_>],
     needed: &[Option<Hypothesis>],
 ) -> Assignment {
+    let movers = Movers::new(scene, needed);
     let cluster_motion: Vec<u32> = (0..needed.len() as u32)
         .into_par_iter()
-        .map(|cluster| leader(scene, neighbors, needed, cluster))
+        .map(|cluster| leader(scene, neighbors, &movers, cluster))
         .collect();
     // For each point, by how much the motion of its cluster increases its distance to the target,
     // metres.
@@ -58,7 +59,7 @@ pub(super) fn spread(
     let point_motion = (0..scene.source.points.len() as u32)
         .into_par_iter()
         .map(|row| match scene.source.labels[row as usize] {
-            NOISE => leader_of_stray(scene, needed, row),
+            NOISE => leader_of_stray(scene, &movers, row),
             label => {
                 let leader = cluster_motion[label as usize];
                 match needed.get(leader as usize).and_then(Option::as_ref) {
@@ -74,26 +75,72 @@ pub(super) fn spread(
     }
 }
 
+/// The clusters with an accepted hypothesis.
+struct Movers<'a> {
+    scene: &'a Scene<'a>,
+    /// The hypotheses, one entry a cluster.
+    needed: &'a [Option<Hypothesis>],
+    /// Corners of the rectangle around each of these clusters that reaches `match_m` beyond it,
+    /// metres along x and y.
+    around: Vec<[[f32; 2]; 2]>,
+}
+
+impl<'a> Movers<'a> {
+    fn new(scene: &'a Scene<'a>, needed: &'a [Option<Hypothesis>]) -> Self {
+        let members = scene.source.members.iter().zip(needed);
+        let members = members.filter(|(_, found)| found.is_some());
+        let around = members.map(|(rows, _)| {
+            let points = rows.iter().map(|&row| scene.source.points[row as usize]);
+            let start = [[f32::INFINITY; 2], [f32::NEG_INFINITY; 2]];
+            points.fold(start, |[low, high], [x, y, _]| {
+                let within_m = scene.options.match_m;
+                [
+                    [low[0].min(x - within_m), low[1].min(y - within_m)],
+                    [high[0].max(x + within_m), high[1].max(y + within_m)],
+                ]
+            })
+        });
+        Self {
+            scene,
+            needed,
+            around: around.collect(),
+        }
+    }
+
+    /// Adds to `found` the clusters with an accepted hypothesis that have a point within `match_m`
+    /// of `position`. Few positions are near one of them.
+    fn near(&self, [x, y, z]: Point, found: &mut Vec<u32>) {
+        let holds = |[low, high]: &[[f32; 2]; 2]| {
+            low[0] <= x && x <= high[0] && low[1] <= y && y <= high[1]
+        };
+        if !self.around.iter().any(holds) {
+            return;
+        }
+        let within_m = self.scene.options.match_m;
+        self.scene.source_within([x, y, z], within_m, |other| {
+            let label = self.scene.source.labels[other as usize];
+            if label != NOISE && self.needed[label as usize].is_some() {
+                found.push(label);
+            }
+        });
+    }
+}
+
 /// The cluster whose motion a cluster gets: its own, that of a larger moving object beside it, or
 /// none.
 fn leader(
     scene: &Scene<'_>,
     neighbors: &[NeighborView<'_>],
-    needed: &[Option<Hypothesis>],
+    movers: &Movers<'_>,
     cluster: u32,
 ) -> u32 {
+    let needed = movers.needed;
     let members = &scene.source.members[cluster as usize];
     let own = needed[cluster as usize].as_ref();
     let size = |cluster: u32| scene.source.members[cluster as usize].len();
     let mut beside: Vec<u32> = Vec::new();
     for row in stride_sample(members, LOOKING) {
-        let position = scene.source.points[row as usize];
-        scene.source_within(position, scene.options.match_m, |other| {
-            let label = scene.source.labels[other as usize];
-            if label != NOISE && label != cluster && needed[label as usize].is_some() {
-                beside.push(label);
-            }
-        });
+        movers.near(scene.source.points[row as usize], &mut beside);
     }
     beside.sort_unstable();
     beside.dedup();
@@ -120,15 +167,13 @@ fn leader(
 }
 
 /// The cluster whose motion a noise point gets, if any.
-fn leader_of_stray(scene: &Scene<'_>, needed: &[Option<Hypothesis>], row: u32) -> u32 {
+fn leader_of_stray(scene: &Scene<'_>, movers: &Movers<'_>, row: u32) -> u32 {
     let position = scene.source.points[row as usize];
     let mut beside: Vec<u32> = Vec::new();
-    scene.source_within(position, scene.options.match_m, |other| {
-        let label = scene.source.labels[other as usize];
-        if label != NOISE && needed[label as usize].is_some() {
-            beside.push(label);
-        }
-    });
+    movers.near(position, &mut beside);
+    if beside.is_empty() {
+        return NOISE;
+    }
     beside.sort_unstable();
     beside.dedup();
     let mut best = (
@@ -136,7 +181,7 @@ fn leader_of_stray(scene: &Scene<'_>, needed: &[Option<Hypothesis>], row: u32) -
         NOISE,
     );
     for label in beside {
-        if let Some(found) = &needed[label as usize] {
+        if let Some(found) = &movers.needed[label as usize] {
             let moved = scene.distance_of(found.motion.apply(position), NOISE);
             if moved < best.0 {
                 best = (moved, label);
@@ -163,4 +208,63 @@ fn is_of(scene: &Scene<'_>, row: u32, residual_m: &[f32]) -> bool {
         }
     });
     worse <= scene.options.point_reject_m * count
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::flow::data::{Random, square_distance};
+    use crate::flow::objects::clouds::{SourceCloud, TargetCloud, lowered};
+    use crate::flow::objects::cluster_cost::Cost;
+    use crate::flow::objects::evidence::NeighborEvidence;
+    use crate::flow::options::ObjectOptions;
+
+    #[test]
+    fn movers_near_a_position_are_those_that_a_look_at_all_points_finds() {
+        let options = ObjectOptions::default();
+        let mut random = Random::new(4);
+        let mut point = |half_m: f64, x: f32| {
+            let [a, y, z] = [0; 3].map(|_| random.uniform(-half_m, half_m) as f32);
+            [x + a, y, z]
+        };
+        let beginnings = [0.0, 3.0, 20.0];
+        let source: Vec<Point> = (0..90).map(|i| point(0.8, beginnings[i % 3])).collect();
+        let labels: Vec<u32> = (0..90).map(|i| i % 3).collect();
+        let cloud = SourceCloud::new(&source, &labels, &options);
+        let scene = Scene::new(&cloud, &TargetCloud::new(&source, &options), &options);
+        let free = Cost {
+            forward_m: 0.0,
+            backward_m: 0.0,
+        };
+        let found = Hypothesis {
+            motion: PlanarMotion::still([0.0; 2]).shifted([1.0, 0.0]),
+            cost: free,
+            still: free,
+            observability: 1.0,
+            normal_motion_m: 1.0,
+            neighbors: NeighborEvidence::default(),
+        };
+        let mut counts = [0; 2];
+        for needed in [[Some(found), None, Some(found)], [None; 3]] {
+            let movers = Movers::new(&scene, &needed);
+            for position in (0..400).map(|i| point(1.6, beginnings[i % 3])) {
+                let at = lowered(position, &options);
+                let is_near = |other: Point| {
+                    let square = square_distance(at, lowered(other, &options));
+                    square < options.match_m * options.match_m
+                };
+                let all = cloud.points.iter().zip(&cloud.labels);
+                let all = all
+                    .filter(|&(&other, &label)| needed[label as usize].is_some() && is_near(other));
+                let mut expected: Vec<u32> = all.map(|(_, &label)| label).collect();
+                let mut near = Vec::new();
+                movers.near(position, &mut near);
+                expected.sort_unstable();
+                near.sort_unstable();
+                assert_eq!(near, expected, "{position:?}");
+                counts[usize::from(near.is_empty())] += 1;
+            }
+        }
+        assert!(counts.iter().all(|&count| count > 50), "{counts:?}");
+    }
 }

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use crate::flow::data::Point;
 use crate::flow::options::ObjectOptions;
-use crate::flow::spatial::{ColumnIndex, Neighborhood, SlotLabels, dbscan, voxel_first};
+use crate::flow::spatial::{ColumnIndex, SlotLabels, dbscan, voxel_first};
 
 /// Bound on the points of a column of an index. At the usual voxels a wall would have to be 58 m high.
 const MOST_IN_A_COLUMN: usize = 4096;
@@ -114,9 +114,7 @@ fn normal(near: &ColumnIndex, point: Point, options: &ObjectOptions) -> Point {
     let range = point[0].hypot(point[1]);
     let [base, slope] = options.normal_m;
     let radius = (base + slope * range).min(options.match_m);
-    let mut neighborhood = Neighborhood::of(point);
-    near.within(point, radius, |_, other| neighborhood.add(other));
-    let flat = neighborhood.flat();
+    let flat = near.plane_at(point, radius);
     flat.map_or([0.0; 3], |flat| flat.normal)
 }
 

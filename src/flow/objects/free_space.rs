@@ -172,8 +172,8 @@ pub(super) fn passed_m(range_m: f32) -> f32 {
 /// The bin of a position's direction, and its range, metres.
 fn direction([x, y, z]: Point) -> (usize, f32) {
     let square = x * x + y * y;
-    let azimuth = ((atan2(y, x) + PI) / AZIMUTH) as usize;
-    let elevation = ((atan2(z, square.sqrt()) + FRAC_PI_2) / ELEVATION) as usize;
+    let azimuth = ((atan2(y, x) + PI) / AZIMUTH) as u32 as usize;
+    let elevation = ((atan2(z, square.sqrt()) + FRAC_PI_2) / ELEVATION) as u32 as usize;
     let angle = azimuth.min(AZIMUTHS - 1) * ELEVATIONS + elevation.min(ELEVATIONS - 1);
     (angle, (square + z * z).sqrt())
 }

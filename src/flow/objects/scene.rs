@@ -122,11 +122,9 @@ impl<'a> Scene<'a> {
 
     /// Calls `see` with every source point within `within_m` metres of `position`, with scaled
     /// heights.
-    pub(super) fn source_within(&self, position: Point, within_m: f32, mut see: impl FnMut(u32)) {
+    pub(super) fn source_within(&self, position: Point, within_m: f32, see: impl FnMut(u32)) {
         let position = lowered(position, self.options);
-        self.source
-            .near
-            .within(position, within_m, |row, _| see(row));
+        self.source.near.within(position, within_m, see);
     }
 
     /// Distance from `position` to the target for a point of `cluster`, metres, truncated. With

@@ -8,7 +8,7 @@ use std::sync::OnceLock;
 use rayon::prelude::*;
 
 use crate::flow::data::{Point, get_or_compute, stride_sample};
-use crate::flow::spatial::{ColumnIndex, Neighborhood, PlaneFit};
+use crate::flow::spatial::{ColumnIndex, PlaneFit};
 
 /// Bound on the points of a column of the index.
 const MOST_IN_A_COLUMN: usize = 4096;
@@ -73,10 +73,7 @@ impl Surfels {
     fn at(&self, slot: usize) -> Option<Surfel> {
         let point = self.points[slot];
         let flat = get_or_compute(&self.flats[slot], || {
-            let mut neighborhood = Neighborhood::of(point);
-            self.index
-                .within(point, self.within_m, |_, other| neighborhood.add(other));
-            neighborhood.flat()
+            self.index.plane_at(point, self.within_m)
         });
         flat.map(|flat| Surfel { point, flat })
     }

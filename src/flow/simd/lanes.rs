@@ -39,6 +39,9 @@ pub(in crate::flow) unsafe trait Lanes: Copy {
     unsafe fn less(self, other: Self) -> u32;
     /// The minimum of the floats. No float may be NaN.
     unsafe fn least(self) -> f32;
+    /// `sums` with the products of the floats added in double precision. A product goes to the sum
+    /// of its place modulo four.
+    unsafe fn add_products(self, other: Self, sums: [f64; 4]) -> [f64; 4];
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -136,6 +139,49 @@ mod x86 {
             // SAFETY: the caller has avx512f.
             unsafe { _mm512_reduce_min_ps(self.0) }
         }
+        #[inline(always)]
+        unsafe fn add_products(self, other: Self, sums: [f64; 4]) -> [f64; 4] {
+            // SAFETY: the caller has avx512f.
+            unsafe {
+                let [a, b] = [self.0, other.0];
+                let sums = added(
+                    _mm512_extractf32x4_ps::<0>(a),
+                    _mm512_extractf32x4_ps::<0>(b),
+                    sums,
+                );
+                let sums = added(
+                    _mm512_extractf32x4_ps::<1>(a),
+                    _mm512_extractf32x4_ps::<1>(b),
+                    sums,
+                );
+                let sums = added(
+                    _mm512_extractf32x4_ps::<2>(a),
+                    _mm512_extractf32x4_ps::<2>(b),
+                    sums,
+                );
+                added(
+                    _mm512_extractf32x4_ps::<3>(a),
+                    _mm512_extractf32x4_ps::<3>(b),
+                    sums,
+                )
+            }
+        }
+    }
+
+    /// `sums` with the products of four floats added in double precision.
+    ///
+    /// # Safety
+    /// The caller has avx.
+    #[inline(always)]
+    unsafe fn added(a: __m128, b: __m128, sums: [f64; 4]) -> [f64; 4] {
+        let mut added = [0.0; 4];
+        // SAFETY: the caller has avx, and the arrays have 4 doubles.
+        unsafe {
+            let products = _mm256_mul_pd(_mm256_cvtps_pd(a), _mm256_cvtps_pd(b));
+            let sums = _mm256_add_pd(_mm256_loadu_pd(sums.as_ptr()), products);
+            _mm256_storeu_pd(added.as_mut_ptr(), sums);
+        }
+        added
     }
 
     /// An AVX register of 8 floats, with FMA.
@@ -234,6 +280,20 @@ mod x86 {
                 _mm_cvtss_f32(one)
             }
         }
+        #[inline(always)]
+        unsafe fn add_products(self, other: Self, sums: [f64; 4]) -> [f64; 4] {
+            // SAFETY: the caller has avx2.
+            unsafe {
+                let [a, b] = [self.0, other.0];
+                let [low_a, low_b] = [_mm256_castps256_ps128(a), _mm256_castps256_ps128(b)];
+                let sums = added(low_a, low_b, sums);
+                added(
+                    _mm256_extractf128_ps::<1>(a),
+                    _mm256_extractf128_ps::<1>(b),
+                    sums,
+                )
+            }
+        }
     }
 }
 
@@ -319,5 +379,9 @@ unsafe impl Lanes for F32x4 {
     #[inline(always)]
     unsafe fn least(self) -> f32 {
         self.0.into_iter().fold(f32::INFINITY, f32::min)
+    }
+    #[inline(always)]
+    unsafe fn add_products(self, other: Self, sums: [f64; 4]) -> [f64; 4] {
+        core::array::from_fn(|i| sums[i] + f64::from(self.0[i]) * f64::from(other.0[i]))
     }
 }

@@ -6,6 +6,8 @@
 use std::ops::Range;
 
 use super::column_kernels::{Wanted, each_level, each_near, nearest};
+use super::neighborhood::Neighborhood;
+use super::plane::PlaneFit;
 use super::slots::{MOST_LANES, Slots, padded};
 use super::tiles::Tiles;
 use crate::flow::data::{Point, stride_sample};
@@ -13,8 +15,6 @@ use crate::flow::simd::Isa;
 
 /// Side of a square, in columns. Its centers share one search.
 const TOGETHER: f32 = 5.0;
-/// Factor on a radius that covers its rounding.
-const ROUNDED_UP: f32 = 1.0 + 4.0 * f32::EPSILON;
 
 /// A point cloud indexed by vertical columns. A slot is a point's place in the order of the columns.
 #[derive(Debug)]
@@ -98,16 +98,20 @@ impl ColumnIndex {
         SlotLabels(padded(labels, self.len(), f32::NAN))
     }
 
-    /// Calls `see` with the input row and the coordinates of every point less than `within_m`
-    /// metres from `center`.
+    /// Calls `see` with the input row of every point less than `within_m` metres from `center`.
     #[inline]
-    pub(crate) fn within(&self, center: Point, within_m: f32, mut see: impl FnMut(u32, Point)) {
+    pub(crate) fn within(&self, center: Point, within_m: f32, mut see: impl FnMut(u32)) {
         each_near(self.isa, &self.slots, &[center], within_m, |first, bits| {
             for bit in ones(bits.into()) {
-                let slot = first + bit as usize;
-                see(self.rows[slot], self.point(slot));
+                see(self.rows[first + bit as usize]);
             }
         });
+    }
+
+    /// The plane of the points less than `within_m` metres from `center`. None where there are too
+    /// few, or where they do not lie on a plane.
+    pub(crate) fn plane_at(&self, center: Point, within_m: f32) -> Option<PlaneFit> {
+        Neighborhood::of(self.isa, &self.slots, center, within_m).flat()
     }
 
     /// The slots of all points less than `within_m` metres from one of `centers`, in ascending order.
@@ -173,28 +177,12 @@ impl ColumnIndex {
         within_m: f32,
         label: Option<(&[f32], f32)>,
     ) -> Option<(usize, f32)> {
-        let search = |square: f32, half_m: f32| {
-            let wanted = Wanted {
-                center,
-                square,
-                label,
-            };
-            nearest(self.isa, &self.slots, wanted, half_m)
+        let wanted = Wanted {
+            center,
+            within_m,
+            label,
         };
-        // The columns within half a side are at most four, and hold the nearest point of most
-        // queries.
-        let half_m = 0.5 * self.slots.tiles.column_m();
-        let square = within_m * within_m;
-        let mut reach_m = within_m;
-        if half_m < within_m
-            && let Some((least, slot)) = search(square, half_m)
-        {
-            if least < half_m * half_m {
-                return Some((slot, least));
-            }
-            reach_m = (least.sqrt() * ROUNDED_UP).min(within_m);
-        }
-        search(square, reach_m).map(|(square, slot)| (slot, square))
+        nearest(self.isa, &self.slots, wanted)
     }
 
     #[inline]

@@ -14,26 +14,23 @@ use crate::flow::simd::{F32x4, Isa, Lanes};
 #[cfg(target_arch = "x86_64")]
 use crate::flow::simd::{F32x8, F32x16};
 
+/// Factor on a radius that covers its rounding.
+const ROUNDED_UP: f32 = 1.0 + 4.0 * f32::EPSILON;
+
 /// The points that a search may find.
 #[derive(Clone, Copy)]
 pub(super) struct Wanted<'a> {
     pub(super) center: Point,
-    /// Squared distance that a point must be below, square metres.
-    pub(super) square: f32,
+    /// Distance that a point must be below, metres.
+    pub(super) within_m: f32,
     /// A label for each slot, and the label that a point must have.
     pub(super) label: Option<(&'a [f32], f32)>,
 }
 
-/// A search in the columns that touch the square of half side `half_m` around the center.
-///
-/// Returns the squared distance and the slot of the nearest point. Of equally near points it is the
-/// one of the lowest slot.
-pub(super) fn nearest(
-    isa: Isa,
-    slots: &Slots,
-    wanted: Wanted<'_>,
-    half_m: f32,
-) -> Option<(f32, usize)> {
+/// The slot and the squared distance of the nearest point. Of equally near points it is the one of
+/// the lowest slot.
+#[inline]
+pub(super) fn nearest(isa: Isa, slots: &Slots, wanted: Wanted<'_>) -> Option<(usize, f32)> {
     if let Some((labels, _)) = wanted.label {
         assert_eq!(labels.len(), slots.padded());
     }
@@ -42,15 +39,15 @@ pub(super) fn nearest(
     unsafe {
         match (isa, wanted.label) {
             #[cfg(target_arch = "x86_64")]
-            (Isa::Avx512, None) => nearest_avx512::<false>(slots, wanted, half_m),
+            (Isa::Avx512, None) => nearest_avx512::<false>(slots, wanted),
             #[cfg(target_arch = "x86_64")]
-            (Isa::Avx512, Some(_)) => nearest_avx512::<true>(slots, wanted, half_m),
+            (Isa::Avx512, Some(_)) => nearest_avx512::<true>(slots, wanted),
             #[cfg(target_arch = "x86_64")]
-            (Isa::Avx2, None) => nearest_avx2::<false>(slots, wanted, half_m),
+            (Isa::Avx2, None) => nearest_avx2::<false>(slots, wanted),
             #[cfg(target_arch = "x86_64")]
-            (Isa::Avx2, Some(_)) => nearest_avx2::<true>(slots, wanted, half_m),
-            (_, None) => nearest_in::<F32x4, false>(slots, wanted, half_m),
-            (_, Some(_)) => nearest_in::<F32x4, true>(slots, wanted, half_m),
+            (Isa::Avx2, Some(_)) => nearest_avx2::<true>(slots, wanted),
+            (_, None) => nearest_in::<F32x4, false>(slots, wanted),
+            (_, Some(_)) => nearest_in::<F32x4, true>(slots, wanted),
         }
     }
 }
@@ -103,50 +100,71 @@ pub(super) fn each_level(
 unsafe fn nearest_in<L: Lanes, const LABELLED: bool>(
     slots: &Slots,
     wanted: Wanted<'_>,
-    half_m: f32,
-) -> Option<(f32, usize)> {
+) -> Option<(usize, f32)> {
     let Wanted {
         center,
-        square,
+        within_m,
         label,
     } = wanted;
+    // The columns within half a side are at most four, and hold the nearest point of most searches.
+    let half_m = 0.5 * slots.tiles.column_m();
+    let mut is_last = half_m >= within_m;
+    let mut reach_m = if is_last { within_m } else { half_m };
     // SAFETY: the caller has the instruction set. Loads begin at slots that exist and end before
     // the padding does.
     unsafe {
-        let center_lanes = center.map(|c| L::splat(c));
-        let limit = L::splat(square);
+        let center_lanes = splat::<L>(center);
+        let limit = L::splat(within_m * within_m);
         let (labels, label) = label.unwrap_or((&[], 0.0));
         let label = L::splat(label);
-        let (mut least, mut first_slots) = (limit, L::splat(0.0));
-        slots.tiles.each_run(around(&[center], half_m), |run| {
-            let mut first = run.start;
-            while first < run.end {
-                let mut squares = squares_at::<L>(slots, center_lanes, first);
-                if LABELLED {
-                    let labels = L::load(labels.as_ptr().add(first));
-                    squares = squares.where_equal(labels, label, L::splat(f32::INFINITY));
+        loop {
+            let (mut least, mut first_slots) = (limit, L::splat(0.0));
+            slots.tiles.each_run(square_around(center, reach_m), |run| {
+                let mut first = run.start;
+                while first < run.end {
+                    let mut squares = squares_at::<L>(slots, center_lanes, first);
+                    if LABELLED {
+                        let labels = L::load(labels.as_ptr().add(first));
+                        squares = squares.where_equal(labels, label, L::splat(f32::INFINITY));
+                    }
+                    let here = L::splat(f32::from_bits(first as u32));
+                    first_slots = here.where_less(squares, least, first_slots);
+                    least = squares.min(least);
+                    first += L::COUNT;
                 }
-                let here = L::splat(f32::from_bits(first as u32));
-                first_slots = here.where_less(squares, least, first_slots);
-                least = squares.min(least);
-                first += L::COUNT;
+            });
+            let best = least.least();
+            // All points nearer than the reach were looked at.
+            if best < reach_m * reach_m || is_last {
+                let is_found = best < within_m * within_m;
+                return is_found.then(|| (lowest_slot(least, best, first_slots), best));
             }
-        });
-        let best = least.least();
-        if best >= square {
-            return None;
+            reach_m = (best.sqrt() * ROUNDED_UP).min(within_m);
+            is_last = true;
         }
-        let mut firsts = [0.0; MOST_LANES];
-        first_slots.store(firsts.as_mut_ptr());
-        let mut equals = !L::splat(best).less(least) & lowest(L::COUNT);
-        let mut slot = usize::MAX;
-        while equals != 0 {
-            let lane = equals.trailing_zeros() as usize;
-            equals &= equals - 1;
-            slot = slot.min(firsts[lane].to_bits() as usize + lane);
-        }
-        Some((best, slot))
     }
+}
+
+/// The lowest of the slots whose squared distance is `best`, the least one. Slots are counted from
+/// the first one of their register.
+///
+/// # Safety
+/// The caller has the instruction set of `L`.
+#[inline(always)]
+unsafe fn lowest_slot<L: Lanes>(squares: L, best: f32, first_slots: L) -> usize {
+    let mut firsts = [0.0; MOST_LANES];
+    // SAFETY: the caller has the instruction set, and a register fits.
+    let mut equals = unsafe {
+        first_slots.store(firsts.as_mut_ptr());
+        !L::splat(best).less(squares) & lowest(L::COUNT)
+    };
+    let mut slot = usize::MAX;
+    while equals != 0 {
+        let lane = equals.trailing_zeros() as usize;
+        equals &= equals - 1;
+        slot = slot.min(firsts[lane].to_bits() as usize + lane);
+    }
+    slot
 }
 
 /// # Safety
@@ -167,7 +185,7 @@ unsafe fn each_near_in<L: Lanes>(
                 let wanted = lowest(L::COUNT.min(run.end - first));
                 let mut bits = 0;
                 for center in centers {
-                    let center = center.map(|c| L::splat(c));
+                    let center = splat::<L>(*center);
                     bits |= squares_at::<L>(slots, center, first).less(limit) & wanted;
                     if bits == wanted {
                         break;
@@ -195,7 +213,7 @@ unsafe fn each_level_in<L: Lanes>(
     // SAFETY: as in `nearest_in`.
     unsafe {
         let [low, high] = [center[2] - height_m, center[2] + height_m].map(|z| L::splat(z));
-        slots.tiles.each_run(around(&[center], half_m), |run| {
+        slots.tiles.each_run(square_around(center, half_m), |run| {
             let mut first = run.start;
             while first < run.end {
                 let heights = L::load(slots.axes[2].as_ptr().add(first));
@@ -215,15 +233,49 @@ unsafe fn each_level_in<L: Lanes>(
 /// The caller has the instruction set of `L`, and the slot exists.
 #[inline(always)]
 unsafe fn squares_at<L: Lanes>(slots: &Slots, center: [L; 3], first: usize) -> L {
+    // SAFETY: the caller's.
+    unsafe { squares_of(away_at(slots, center, first)) }
+}
+
+/// Offsets of `center` from a register of points from the slot `first` on.
+///
+/// # Safety
+/// As [`squares_at`].
+#[inline(always)]
+pub(super) unsafe fn away_at<L: Lanes>(slots: &Slots, center: [L; 3], first: usize) -> [L; 3] {
     debug_assert!(first + MOST_LANES <= slots.padded());
+    let [x, y, z] = center;
     // SAFETY: the caller has the instruction set. At least `MOST_LANES` floats follow every slot.
     unsafe {
-        let away = |axis: usize| {
-            let away = center[axis].sub(L::load(slots.axes[axis].as_ptr().add(first)));
-            away.mul(away)
-        };
-        away(0).add(away(1)).add(away(2))
+        let axis = |axis: usize| L::load(slots.axes[axis].as_ptr().add(first));
+        [x.sub(axis(0)), y.sub(axis(1)), z.sub(axis(2))]
     }
+}
+
+/// Squares of the lengths of offsets.
+///
+/// # Safety
+/// The caller has the instruction set of `L`.
+#[inline(always)]
+pub(super) unsafe fn squares_of<L: Lanes>([x, y, z]: [L; 3]) -> L {
+    // SAFETY: the caller has the instruction set.
+    unsafe { x.mul(x).add(y.mul(y)).add(z.mul(z)) }
+}
+
+/// A register of each coordinate.
+///
+/// # Safety
+/// The caller has the instruction set of `L`.
+#[inline(always)]
+pub(super) unsafe fn splat<L: Lanes>([x, y, z]: Point) -> [L; 3] {
+    // SAFETY: the caller has the instruction set.
+    unsafe { [L::splat(x), L::splat(y), L::splat(z)] }
+}
+
+/// The corners of the square of half side `half_m` around `center`, along x and y.
+#[inline(always)]
+pub(super) fn square_around([x, y, _]: Point, half_m: f32) -> [[f32; 2]; 2] {
+    [[x - half_m, y - half_m], [x + half_m, y + half_m]]
 }
 
 /// The corners of the rectangle that reaches `within_m` beyond all of `centers`, along x and y.
@@ -253,10 +305,9 @@ macro_rules! compiled {
         unsafe fn $nearest<const LABELLED: bool>(
             slots: &Slots,
             wanted: Wanted<'_>,
-            half_m: f32,
-        ) -> Option<(f32, usize)> {
+        ) -> Option<(usize, f32)> {
             // SAFETY: the features are enabled; the rest is the caller's.
-            unsafe { nearest_in::<$lanes, LABELLED>(slots, wanted, half_m) }
+            unsafe { nearest_in::<$lanes, LABELLED>(slots, wanted) }
         }
         #[target_feature(enable = $features)]
         unsafe fn $each_near(

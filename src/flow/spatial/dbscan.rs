@@ -10,7 +10,7 @@ use rayon::prelude::*;
 
 use super::key_table::KeyTable;
 use super::voxel::voxel_first;
-use crate::flow::data::{Point, floor, square_distance};
+use crate::flow::data::{Point, floors, square_distance};
 
 /// Number of core points in a cell above which they are voxel-downsampled. The voxel side is the
 /// radius over `VOXELS`.
@@ -230,10 +230,8 @@ const HEIGHT: u64 = 21;
 impl Cells {
     fn new(points: &[Point], side_m: f32) -> Self {
         // Points out of range belong to no cell.
-        let in_reach = |&row: &u32| {
-            let point = points[row as usize];
-            point.iter().all(|c| (c / side_m).abs() < REACH)
-        };
+        let reach_m = REACH * side_m;
+        let in_reach = |&row: &u32| points[row as usize].iter().all(|c| c.abs() < reach_m);
         let rows: Vec<u32> = (0..points.len() as u32).filter(in_reach).collect();
         let keys: Vec<u64> = rows
             .iter()
@@ -367,9 +365,10 @@ fn columns(cells: &[(u64, u32)]) -> (Vec<Column>, Vec<u32>) {
     (columns, column_of)
 }
 
-fn key(point: Point, side_m: f32) -> u64 {
-    let at = |c: f32| u64::from((floor(c / side_m).clamp(-REACH, REACH) + REACH + 4.0) as u32);
-    at(point[0]) << (2 * HEIGHT) | at(point[1]) << HEIGHT | at(point[2])
+fn key([x, y, z]: Point, side_m: f32) -> u64 {
+    let [x, y, z] = floors([x / side_m, y / side_m, z / side_m], [-REACH, REACH]);
+    let at = |floor: i32| u64::from((floor + REACH as i32 + 4).cast_unsigned());
+    at(x) << (2 * HEIGHT) | at(y) << HEIGHT | at(z)
 }
 
 /// Union-find over cells; the lowest index is the root of its set.

@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use crate::flow::data::Point;
+use super::neighborhood::Neighborhood;
 
 /// Least number of points, the center included, for a plane.
 const NEIGHBORS: f64 = 4.0;
@@ -28,44 +28,10 @@ pub(crate) struct PlaneFit {
     pub(crate) variance: f32,
 }
 
-/// Sums over the points around a center point, for their mean and covariance.
-pub(crate) struct Neighborhood {
-    middle: Point,
-    count: f64,
-    sum: [f64; 3],
-    /// Sums of x x, x y, x z, y y, y z and z z.
-    products: [f64; 6],
-}
-
 impl Neighborhood {
-    /// An empty neighborhood of the center `middle`.
-    pub(crate) fn of(middle: Point) -> Self {
-        Self {
-            middle,
-            count: 0.0,
-            sum: [0.0; 3],
-            products: [0.0; 6],
-        }
-    }
-
-    /// Adds a point.
-    #[inline]
-    pub(crate) fn add(&mut self, point: Point) {
-        let away: [f64; 3] = core::array::from_fn(|a| f64::from(point[a] - self.middle[a]));
-        let [x, y, z] = away;
-        self.count += 1.0;
-        for (sum, c) in self.sum.iter_mut().zip(away) {
-            *sum += c;
-        }
-        let products = [x * x, x * y, x * z, y * y, y * z, z * z];
-        for (sum, product) in self.products.iter_mut().zip(products) {
-            *sum += product;
-        }
-    }
-
     /// The plane of the points; none where there are fewer than four, or where they do not lie on a
     /// plane.
-    pub(crate) fn flat(&self) -> Option<PlaneFit> {
+    pub(super) fn flat(&self) -> Option<PlaneFit> {
         if self.count < NEIGHBORS {
             return None;
         }
@@ -99,7 +65,7 @@ fn flat(spread: &Matrix3<f64>) -> Option<PlaneFit> {
     }
     // With the least eigenvalue subtracted, the columns are perpendicular to its eigenvector.
     let across = spread - Matrix3::identity() * least;
-    let [a, b, c] = [0, 1, 2].map(|i| across.column(i).into_owned());
+    let (a, b, c) = (across.column(0), across.column(1), across.column(2));
     let candidates = [a.cross(&b), b.cross(&c), c.cross(&a)];
     let longest = candidates
         .into_iter()

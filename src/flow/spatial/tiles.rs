@@ -7,7 +7,7 @@
 use std::ops::Range;
 
 use super::key_table::KeyTable;
-use crate::flow::data::Point;
+use crate::flow::data::{Point, floors};
 
 /// Bound on a column's index along an axis, on each side of the origin. Points beyond it share the
 /// outermost column.
@@ -15,6 +15,8 @@ const REACH: f32 = (1 << 30) as f32;
 /// Binary logarithm of the columns along the side of a tile.
 const SIDE_BITS: i32 = 3;
 const SIDE: i32 = 1 << SIDE_BITS;
+/// The columns of a tile with the same x.
+const ROW: u64 = (1 << SIDE) - 1;
 
 /// A tile that holds points.
 #[derive(Clone, Copy, Debug, Default)]
@@ -43,7 +45,7 @@ impl Tiles {
         let columns_per_m = 1.0 / column_m;
         let columns = points
             .iter()
-            .map(|&[x, y, _]| column_of([x, y], columns_per_m));
+            .map(|&[x, y, _]| columns_at([x, y], columns_per_m));
         let columns: Vec<[i32; 2]> = columns.collect();
         let mut table = KeyTable::<Tile>::new(0);
         // Points that follow each other often share a tile.
@@ -123,8 +125,8 @@ impl Tiles {
     /// rectangle between two corners, metres along x and y, the lower one first. The ranges ascend.
     #[inline(always)]
     pub(super) fn each_run(&self, corners: [[f32; 2]; 2], mut see: impl FnMut(Range<usize>)) {
-        let [[left, low], [right, high]] =
-            corners.map(|corner| column_of(corner, self.columns_per_m));
+        let [[left, low], [right, high]] = corners;
+        let [left, low, right, high] = columns_at([left, low, right, high], self.columns_per_m);
         let (mut tile_x, last_x) = (left >> SIDE_BITS, right >> SIDE_BITS);
         // `while` compiles to less than `for` over an inclusive range.
         while tile_x <= last_x {
@@ -133,7 +135,7 @@ impl Tiles {
             while tile_y <= last_y {
                 if let Some(&tile) = self.table.get(key([tile_x, tile_y])) {
                     let (y_low, y_high) = inside(low, high, tile_y);
-                    let row = ((2_u64 << (y_high - y_low)) - 1) << y_low;
+                    let row = (ROW << y_low) & (ROW >> (SIDE.cast_unsigned() - 1 - y_high));
                     let mut place = x_low << SIDE_BITS;
                     while place <= x_high << SIDE_BITS {
                         let wanted = (tile.occupied & row << place).count_ones();
@@ -156,24 +158,24 @@ impl Tiles {
 /// The part of the columns from `low` to `high` that lies in a tile, counted from the tile's side.
 #[inline(always)]
 fn inside(low: i32, high: i32, tile: i32) -> (u32, u32) {
-    let begin = tile << SIDE_BITS;
-    let [low, high] = [low.max(begin), high.min(begin + SIDE - 1)];
-    (
-        (low - begin).cast_unsigned(),
-        (high - begin).cast_unsigned(),
-    )
+    let at = |column: i32, beyond: u32| {
+        if column >> SIDE_BITS == tile {
+            (column & (SIDE - 1)).cast_unsigned()
+        } else {
+            beyond
+        }
+    };
+    (at(low, 0), at(high, SIDE.cast_unsigned() - 1))
 }
 
-/// Indices of the column that a place lies in, metres along x and y. They grow with the coordinates, rounding included.
+/// Indices of columns along x or y at the coordinates `places`, metres. They grow with the
+/// coordinates, rounding included.
 #[inline(always)]
-fn column_of(place: [f32; 2], columns_per_m: f32) -> [i32; 2] {
-    place.map(|c| {
-        let columns = c * columns_per_m;
-        let columns = if columns < REACH { columns } else { REACH };
-        let columns = if columns > -REACH { columns } else { -REACH };
-        let toward_zero = columns as i32;
-        toward_zero - i32::from(toward_zero as f32 > columns)
-    })
+fn columns_at<const N: usize>(mut places: [f32; N], columns_per_m: f32) -> [i32; N] {
+    for place in &mut places {
+        *place *= columns_per_m;
+    }
+    floors(places, [-REACH, REACH])
 }
 
 fn tile_of(column: [i32; 2]) -> [i32; 2] {

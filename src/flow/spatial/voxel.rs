@@ -1,7 +1,7 @@
 //! Voxel downsampling: one point a voxel, so that near rings weigh no more than far walls.
 
 use super::key_table::KeyTable;
-use crate::flow::data::{Point, floor};
+use crate::flow::data::{Point, floors};
 
 /// Bound on a voxel's index along an axis, on each side of the origin.
 const REACH: f32 = (1 << 20) as f32;
@@ -16,7 +16,8 @@ const KEYS_AT_ONCE: usize = 4096;
 /// the order of their first points. Points beyond [`REACH`] voxels and points that are not finite are
 /// dropped.
 pub(crate) fn voxel_mean(points: &[Point], side_m: f32) -> Vec<Point> {
-    let is_in_reach = |point: &Point| point.iter().all(|c| (c / side_m).abs() < REACH);
+    let reach_m = REACH * side_m;
+    let is_in_reach = |point: &Point| point.iter().all(|c| c.abs() < reach_m);
     let mut numbers = KeyTable::<u32>::new(points.len() / EXPECTED);
     let mut sums: Vec<([f64; 3], f64)> = Vec::new();
     let mut last = (u64::MAX, 0);
@@ -65,14 +66,15 @@ pub(crate) fn voxel_first(points: &[Point], side_m: f32) -> Vec<u32> {
 
 /// Calls `see` with each row and the key of its point's voxel: 21 bits an axis, x in the highest.
 fn each_key(points: &[Point], side_m: f32, mut see: impl FnMut(u32, u64)) {
-    let index = |c: f32| (floor(c / side_m).clamp(-REACH, REACH - 1.0) + REACH) as u32;
+    let index = |floor: i32| u64::from((floor + REACH as i32).cast_unsigned());
     let mut keys = Vec::with_capacity(KEYS_AT_ONCE.min(points.len()));
     let mut rows = 0..;
     for points in points.chunks(KEYS_AT_ONCE) {
         keys.clear();
-        keys.extend(points.iter().map(|point| {
-            let [x, y, z] = point.map(|c| u64::from(index(c)));
-            x << 42 | y << 21 | z
+        keys.extend(points.iter().map(|&[x, y, z]| {
+            let voxel = [x / side_m, y / side_m, z / side_m];
+            let [x, y, z] = floors(voxel, [-REACH, REACH - 1.0]);
+            index(x) << 42 | index(y) << 21 | index(z)
         }));
         for (&key, row) in keys.iter().zip(&mut rows) {
             see(row, key);

@@ -118,7 +118,7 @@ fn around(points: &[Point], values: &[f32]) -> Vec<f32> {
     let index = ColumnIndex::new(points, AROUND_M);
     let mean = |&point: &Point| {
         let (mut sum, mut count) = (0.0, 0.0);
-        index.within(point, AROUND_M, |row, _| {
+        index.within(point, AROUND_M, |row| {
             sum += values[row as usize];
             count += 1.0;
         });

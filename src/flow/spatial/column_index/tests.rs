@@ -100,10 +100,7 @@ fn on_a_lattice_far_out_nothing_near_is_left_out_and_all_sets_find_the_same_of_e
             let first = sets[0].nearest(center, within_m);
             for index in &sets {
                 let mut within = Vec::new();
-                index.within(center, within_m, |row, point| {
-                    assert_eq!(point, cloud[row as usize]);
-                    within.push(row);
-                });
+                index.within(center, within_m, |row| within.push(row));
                 within.sort_unstable();
                 assert_eq!(within, rows);
                 assert_eq!(index.nearest(center, within_m), first);
@@ -179,4 +176,32 @@ fn nothing_is_near_in_an_empty_cloud_and_far_from_every_point() {
     assert_eq!(index.nearest([f32::NAN; 3], 0.5), None);
     assert_eq!(index.nearest([f32::INFINITY, 0.0, 0.0], 0.5), None);
     assert_eq!(index.nearest([1e30, -1e30, 0.25], 0.5), Some((0, 0.0625)));
+}
+
+#[test]
+fn the_sums_around_a_point_are_those_of_a_search_of_all_with_the_same_bits_on_all_sets() {
+    let (cloud, positions) = scattered(900, 60, 2.0);
+    let sets: Vec<ColumnIndex> = on_all_sets(&cloud, 0.35).collect();
+    let sums = |index: &ColumnIndex, center: Point| {
+        let found = Neighborhood::of(index.isa, &index.slots, center, 0.7);
+        [&[found.count], &found.sum[..], &found.products].concat()
+    };
+    for &center in &positions {
+        let mut expected = [0.0; 10];
+        for (_, row) in by_definition(&cloud, center, 0.7) {
+            let point = cloud[row as usize];
+            let [x, y, z] = [0, 1, 2].map(|axis: usize| f64::from(center[axis] - point[axis]));
+            let terms = [1.0, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z];
+            for (sum, term) in expected.iter_mut().zip(terms) {
+                *sum += term;
+            }
+        }
+        let first = sums(&sets[0], center);
+        for (sum, expected) in first.iter().zip(expected) {
+            assert!((sum - expected).abs() < 1e-12, "{sum}, not {expected}");
+        }
+        for index in &sets {
+            assert_eq!(sums(index, center), first);
+        }
+    }
 }
