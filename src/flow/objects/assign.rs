@@ -13,7 +13,7 @@ use super::neighbor_view::NeighborView;
 use super::planar_motion::PlanarMotion;
 use super::scene::Scene;
 use crate::flow::data::{Point, stride_sample};
-use crate::flow::spatial::NOISE;
+use crate::flow::spatial::{NOISE, around};
 
 /// Points of a cluster from which moving objects beside it are searched.
 const LOOKING: usize = 64;
@@ -41,7 +41,7 @@ pub(super) fn spread(
     let movers = Movers::new(scene, needed);
     let cluster_motion: Vec<u32> = (0..needed.len() as u32)
         .into_par_iter()
-        .map(|cluster| leader(scene, neighbors, &movers, cluster))
+        .map(|cluster| leader(neighbors, &movers, cluster))
         .collect();
     // For each point, by how much the motion of its cluster increases its distance to the target,
     // metres.
@@ -59,7 +59,7 @@ pub(super) fn spread(
     let point_motion = (0..scene.source.points.len() as u32)
         .into_par_iter()
         .map(|row| match scene.source.labels[row as usize] {
-            NOISE => leader_of_stray(scene, &movers, row),
+            NOISE => leader_of_stray(&movers, row),
             label => {
                 let leader = cluster_motion[label as usize];
                 match needed.get(leader as usize).and_then(Option::as_ref) {
@@ -89,21 +89,14 @@ impl<'a> Movers<'a> {
     fn new(scene: &'a Scene<'a>, needed: &'a [Option<Hypothesis>]) -> Self {
         let members = scene.source.members.iter().zip(needed);
         let members = members.filter(|(_, found)| found.is_some());
-        let around = members.map(|(rows, _)| {
+        let rectangles = members.map(|(rows, _)| {
             let points = rows.iter().map(|&row| scene.source.points[row as usize]);
-            let start = [[f32::INFINITY; 2], [f32::NEG_INFINITY; 2]];
-            points.fold(start, |[low, high], [x, y, _]| {
-                let within_m = scene.options.match_m;
-                [
-                    [low[0].min(x - within_m), low[1].min(y - within_m)],
-                    [high[0].max(x + within_m), high[1].max(y + within_m)],
-                ]
-            })
+            around(points, scene.options.match_m)
         });
         Self {
             scene,
             needed,
-            around: around.collect(),
+            around: rectangles.collect(),
         }
     }
 
@@ -128,13 +121,8 @@ impl<'a> Movers<'a> {
 
 /// The cluster whose motion a cluster gets: its own, that of a larger moving object beside it, or
 /// none.
-fn leader(
-    scene: &Scene<'_>,
-    neighbors: &[NeighborView<'_>],
-    movers: &Movers<'_>,
-    cluster: u32,
-) -> u32 {
-    let needed = movers.needed;
+fn leader(neighbors: &[NeighborView<'_>], movers: &Movers<'_>, cluster: u32) -> u32 {
+    let Movers { scene, needed, .. } = *movers;
     let members = &scene.source.members[cluster as usize];
     let own = needed[cluster as usize].as_ref();
     let size = |cluster: u32| scene.source.members[cluster as usize].len();
@@ -167,7 +155,8 @@ fn leader(
 }
 
 /// The cluster whose motion a noise point gets, if any.
-fn leader_of_stray(scene: &Scene<'_>, movers: &Movers<'_>, row: u32) -> u32 {
+fn leader_of_stray(movers: &Movers<'_>, row: u32) -> u32 {
+    let Movers { scene, needed, .. } = *movers;
     let position = scene.source.points[row as usize];
     let mut beside: Vec<u32> = Vec::new();
     movers.near(position, &mut beside);
@@ -181,7 +170,7 @@ fn leader_of_stray(scene: &Scene<'_>, movers: &Movers<'_>, row: u32) -> u32 {
         NOISE,
     );
     for label in beside {
-        if let Some(found) = &movers.needed[label as usize] {
+        if let Some(found) = &needed[label as usize] {
             let moved = scene.distance_of(found.motion.apply(position), NOISE);
             if moved < best.0 {
                 best = (moved, label);

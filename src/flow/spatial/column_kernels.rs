@@ -179,24 +179,26 @@ unsafe fn each_near_in<L: Lanes>(
     // SAFETY: as in `nearest_in`.
     unsafe {
         let limit = L::splat(within_m * within_m);
-        slots.tiles.each_run(around(centers, within_m), |run| {
-            let mut first = run.start;
-            while first < run.end {
-                let wanted = lowest(L::COUNT.min(run.end - first));
-                let mut bits = 0;
-                for center in centers {
-                    let center = splat::<L>(*center);
-                    bits |= squares_at::<L>(slots, center, first).less(limit) & wanted;
-                    if bits == wanted {
-                        break;
+        slots
+            .tiles
+            .each_run(around(centers.iter().copied(), within_m), |run| {
+                let mut first = run.start;
+                while first < run.end {
+                    let wanted = lowest(L::COUNT.min(run.end - first));
+                    let mut bits = 0;
+                    for center in centers {
+                        let center = splat::<L>(*center);
+                        bits |= squares_at::<L>(slots, center, first).less(limit) & wanted;
+                        if bits == wanted {
+                            break;
+                        }
                     }
+                    if bits != 0 {
+                        see(first, bits);
+                    }
+                    first += L::COUNT;
                 }
-                if bits != 0 {
-                    see(first, bits);
-                }
-                first += L::COUNT;
-            }
-        });
+            });
     }
 }
 
@@ -278,9 +280,9 @@ pub(super) fn square_around([x, y, _]: Point, half_m: f32) -> [[f32; 2]; 2] {
     [[x - half_m, y - half_m], [x + half_m, y + half_m]]
 }
 
-/// The corners of the rectangle that reaches `within_m` beyond all of `centers`, along x and y.
+/// The corners of the rectangle that reaches `within_m` beyond all of `centers`, along x and y, metres.
 #[inline(always)]
-fn around(centers: &[Point], within_m: f32) -> [[f32; 2]; 2] {
+pub(crate) fn around(centers: impl IntoIterator<Item = Point>, within_m: f32) -> [[f32; 2]; 2] {
     let mut corners = [[f32::INFINITY; 2], [f32::NEG_INFINITY; 2]];
     for center in centers {
         for axis in 0..2 {

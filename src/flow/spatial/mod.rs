@@ -12,6 +12,7 @@ mod tiles;
 mod voxel;
 
 pub(crate) use column_index::{ColumnIndex, SlotLabels};
+pub(crate) use column_kernels::around;
 pub(crate) use dbscan::NOISE;
 pub(crate) use index_words::IndexRecord;
 pub(crate) use plane::PlaneFit;
