@@ -3,6 +3,7 @@
 use std::borrow::Cow;
 
 use bytemuck::cast_slice;
+use rayon::prelude::*;
 
 use super::by_cluster;
 use super::by_field;
@@ -14,6 +15,7 @@ use super::result::{Estimate, Solution};
 use crate::flow::data::{Control, DYNAMIC_M, Point, StopReason, transform_point};
 use crate::flow::error::FlowError;
 use crate::flow::field::{Backend, Snapshot, SnapshotError};
+use crate::flow::host::Host;
 use crate::flow::motion::MotionField;
 use crate::flow::objects::Probabilities;
 use crate::flow::options::{CERTAIN_OVERLAP, Ego, LEAST_OVERLAP, Method, Options};
@@ -118,7 +120,7 @@ fn estimate_from(
             None => by_field::residual_motion(backend, &input, field, snapshot)?,
         },
     };
-    let mut estimate = assemble(&input, solved, [began, selected_at]);
+    let mut estimate = assemble(host, &input, solved, [began, selected_at]);
     if lacks_deskew {
         estimate.stop_reason = StopReason::Deadline;
     }
@@ -131,7 +133,12 @@ fn estimate_from(
 
 /// Maps the result for the selected points back to all source points.
 /// The times are those of its begin and of the end of the selection.
-fn assemble(input: &Input<'_>, solved: Solved, [began, selected_at]: [f64; 2]) -> Estimate {
+fn assemble(
+    host: &Host,
+    input: &Input<'_>,
+    solved: Solved,
+    [began, selected_at]: [f64; 2],
+) -> Estimate {
     let (source, selection) = (input.problem.source, input.selection);
     let Solved {
         alignment,
@@ -176,12 +183,20 @@ fn assemble(input: &Input<'_>, solved: Solved, [began, selected_at]: [f64; 2]) -
     // Where the deadline allowed no ego motion, the identity is used.
     if input.options.ego != Ego::Off {
         let ego = ego.unwrap_or_default();
-        for &row in &selection.ego_only_rows {
-            let (from, to) = (source[row], transform_point(&ego, source[row]));
-            flow[row] = core::array::from_fn(|a| to[a] - from[a]);
+        let rows = &selection.ego_only_rows;
+        let moved = rows
+            .par_iter()
+            .map(|&row| transform_point(&ego, source[row]));
+        let moved: Vec<Point> = host.install(|| moved.collect());
+        for (&row, to) in rows.iter().zip(&moved) {
+            flow[row] = core::array::from_fn(|a| to[a] - source[row][a]);
             valid[row] = true;
-            if let Some(objects) = &mut objects {
-                let probabilities = Probabilities::of_ground(to[0].hypot(to[1]));
+        }
+        if let Some(objects) = &mut objects {
+            let of_ground = |to: &Point| Probabilities::of_ground(to[0].hypot(to[1]));
+            let probabilities = moved.par_iter().map(of_ground);
+            let probabilities: Vec<Probabilities> = host.install(|| probabilities.collect());
+            for (&row, probabilities) in rows.iter().zip(probabilities) {
                 objects.confidence[row] = probabilities.confidence;
                 objects.moving[row] = probabilities.moving;
             }

@@ -6,6 +6,7 @@ use std::thread;
 
 use super::adapter::Adapter;
 use super::chamfer::GpuCloud;
+use super::cluster_search::has_kernel;
 use super::device::Device;
 use super::distance::GpuTransform;
 use super::loss::GpuTarget;
@@ -128,7 +129,7 @@ impl Backend for Gpu {
     }
 
     fn searches_clusters(&self) -> bool {
-        self.0.searches_clusters && self.0.has_cluster_kernel()
+        self.0.searches_clusters && has_kernel(&self.0.context)
     }
 
     fn search_clusters(
@@ -136,7 +137,10 @@ impl Backend for Gpu {
         scene: &PackedScene,
         is_over: &dyn Fn() -> bool,
     ) -> Result<Vec<FoundRecord>, BackendError> {
-        self.0.search_clusters(scene, is_over)
+        let Device { context, kind, .. } = &*self.0;
+        self.0
+            .cluster_searches
+            .search(context, *kind, scene, is_over)
     }
 
     fn prepare_target(

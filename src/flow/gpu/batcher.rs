@@ -1,13 +1,12 @@
 //! Submissions: the next iterations of all pairs that are being fitted, as one batch of GPU work.
 //!
-//! A small pair leaves a large GPU idle, so requests that arrive at about the same time are
-//! submitted together. One of the waiting threads submits for all. Pairs stay independent: each has
-//! its own model and stopping rule, and its result is bit-identical to that of a fit alone.
+//! A small pair leaves a large GPU idle, so requests that arrive at about the same time
+//! [share](super::sharing) a submission. Pairs stay independent: each has its own model and stopping
+//! rule, and its result is bit-identical to that of a fit alone.
 
-use core::time::Duration;
-use std::collections::HashMap;
-use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use core::ops::ControlFlow;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use super::context::Context;
 use super::half::Units;
@@ -16,14 +15,10 @@ use super::layout::{STEPS, Status};
 use super::phase::Clock;
 use super::program::{Item, Program, SubmittedLoss};
 use super::request::{Request, write};
+use super::sharing::{Shared, Submit, Ticketed};
 use super::tiling::Plan;
 use crate::flow::data::{Control, locked};
 use crate::flow::field::BackendError;
-
-/// How long the submitting thread waits for further requests.
-const MOMENT: Duration = Duration::from_micros(300);
-/// Interval at which a waiting thread checks its control.
-const CHECK_INTERVAL: Duration = Duration::from_millis(200);
 
 /// The result of a request.
 #[derive(Clone, Debug)]
@@ -48,42 +43,28 @@ pub(super) struct TileThroughput {
 /// The queue of requests for iterations.
 #[derive(Default)]
 pub(super) struct Batch {
-    state: Mutex<State>,
-    changed: Condvar,
-}
-
-#[derive(Default)]
-struct State {
+    shared: Shared<Request, Done>,
     /// Number of networks that are being fitted.
-    members: usize,
-    next_ticket: u64,
-    waiting: Vec<(u64, Request)>,
-    done: HashMap<u64, Result<Done, BackendError>>,
-    /// Whether a thread is submitting.
-    submitting: bool,
+    members: AtomicUsize,
     /// Speed of the latest submission of a kind that shares it.
-    pace: Option<TileThroughput>,
+    pace: Mutex<Option<TileThroughput>>,
 }
 
 impl Batch {
-    fn state(&self) -> MutexGuard<'_, State> {
-        locked(&self.state)
-    }
-
     /// Registers a network that is being fitted.
     pub(super) fn joined(&self) {
-        self.state().members += 1;
-    }
-
-    /// Speed of the latest submission of a kind that shares it.
-    pub(super) fn pace(&self) -> Option<TileThroughput> {
-        self.state().pace
+        self.members.fetch_add(1, Ordering::Relaxed);
     }
 
     /// Unregisters a network whose fit has ended.
     pub(super) fn left(&self) {
-        self.state().members -= 1;
-        self.changed.notify_all();
+        self.members.fetch_sub(1, Ordering::Relaxed);
+        self.shared.expect_fewer();
+    }
+
+    /// Speed of the latest submission of a kind that shares it.
+    pub(super) fn pace(&self) -> Option<TileThroughput> {
+        *locked(&self.pace)
     }
 
     /// Runs the request's iterations, together with those that other threads request meanwhile. Asks
@@ -99,110 +80,64 @@ impl Batch {
         request: Request,
         control: &dyn Control,
     ) -> Result<Done, BackendError> {
-        let mut state = self.state();
-        let ticket = state.next_ticket;
-        state.next_ticket += 1;
-        state.waiting.push((ticket, request));
-        self.changed.notify_all();
-        loop {
-            if let Some(done) = state.done.remove(&ticket) {
-                return done;
-            }
-            if state.submitting {
-                drop(state);
-                let interrupt = control.interrupt();
-                state = self.state();
-                if let Some(interrupt) = interrupt
-                    && state.withdraw(ticket)
-                {
-                    self.changed.notify_all();
-                    return Err(BackendError::Interrupted(interrupt));
-                }
-                let waits =
-                    |state: &mut State| state.submitting && !state.done.contains_key(&ticket);
-                state = self
-                    .changed
-                    .wait_timeout_while(state, CHECK_INTERVAL, waits)
-                    .unwrap_or_else(PoisonError::into_inner)
-                    .0;
-                continue;
-            }
-            state.submitting = true;
-            let incomplete = |state: &mut State| state.shared_waiting() < state.members;
-            state = self
-                .changed
-                .wait_timeout_while(state, MOMENT, incomplete)
-                .unwrap_or_else(PoisonError::into_inner)
-                .0;
-            let taken = state.take(context);
-            drop(state);
-            let requests: Vec<_> = taken.iter().map(|(_, request)| request).collect();
-            let submitted = catch_unwind(AssertUnwindSafe(|| {
-                submit(context, units, &requests, control)
-            }));
-            let submitted = submitted.unwrap_or_else(|_| {
-                let reason = "the driver's bindings panicked".to_owned();
-                context.watchdog.lost(reason.clone());
-                Err(BackendError::Lost(reason))
-            });
-            state = self.state();
-            state.submitting = false;
-            match submitted {
-                Ok(all) => {
-                    if requests[0].kind().shares_pace() {
-                        state.pace = all.first().and_then(|done| done.pace).or(state.pace);
-                    }
-                    let tickets = taken.iter().map(|(ticket, _)| *ticket);
-                    state.done.extend(tickets.zip(all.into_iter().map(Ok)));
-                }
-                Err(error) => {
-                    for (other, _) in &taken {
-                        let own = context.watchdog.check().err().unwrap_or(match &error {
-                            BackendError::Busy => BackendError::Busy,
-                            error => BackendError::Device(error.to_string()),
-                        });
-                        state.done.insert(*other, Err(own));
-                    }
-                }
-            }
-            self.changed.notify_all();
+        let iterations = Iterations {
+            batch: self,
+            context,
+            units,
+            control,
+        };
+        let is_over = || control.interrupt();
+        let watchdog = &context.watchdog;
+        match self.shared.run(watchdog, request, &iterations, &is_over)? {
+            ControlFlow::Continue(done) => Ok(done),
+            ControlFlow::Break(interrupt) => Err(BackendError::Interrupted(interrupt)),
         }
     }
 }
 
-impl State {
-    /// Takes a request out of the queue. Returns false if it was submitted already.
-    fn withdraw(&mut self, ticket: u64) -> bool {
-        let before = self.waiting.len();
-        self.waiting.retain(|(other, _)| *other != ticket);
-        self.waiting.len() < before
-    }
+/// The iterations of networks or linear models, submitted by a thread with its control.
+struct Iterations<'a, 'u> {
+    batch: &'a Batch,
+    context: &'a Context,
+    units: &'a dyn Fn() -> Result<&'u Units, BackendError>,
+    control: &'a dyn Control,
+}
 
-    /// Number of waiting requests that can share a submission.
-    fn shared_waiting(&self) -> usize {
-        let shares = |(_, request): &&(u64, Request)| request.kind().shares_submissions();
-        self.waiting.iter().filter(shares).count()
+impl Submit<Request, Done> for Iterations<'_, '_> {
+    fn expects_more(&self, waiting: &[Ticketed<Request>]) -> bool {
+        let shares = |(_, request): &&Ticketed<Request>| request.kind().shares_submissions();
+        waiting.iter().filter(shares).count() < self.batch.members.load(Ordering::Relaxed)
     }
 
     /// Takes the first request and the others of its kind in order of arrival, up to the capacity of
     /// the GPU. The rest remains in the queue.
-    fn take(&mut self, context: &Context) -> Vec<(u64, Request)> {
-        let kind = self.waiting.first().map(|(_, request)| request.kind());
+    fn take(&self, waiting: &mut Vec<Ticketed<Request>>) -> Vec<Ticketed<Request>> {
+        let budget = &self.context.budget;
+        let kind = waiting.first().map(|(_, request)| request.kind());
         let mut chunks = 0;
         let mut fitting = 0;
         let mut full = false;
-        let taken = self.waiting.extract_if(.., |(_, request)| {
+        let taken = waiting.extract_if(.., |(_, request)| {
             let alone = !request.kind().shares_submissions() && fitting > 0;
             if full || alone || Some(request.kind()) != kind {
                 return false;
             }
             chunks += request.cut.chunks.count as u64;
-            full = fitting > 0
-                && (chunks > context.budget.chunks || fitting as u64 >= context.budget.lanes);
+            full = fitting > 0 && (chunks > budget.chunks || fitting as u64 >= budget.lanes);
             fitting += usize::from(!full);
             !full
         });
         taken.collect()
+    }
+
+    fn submit(&self, requests: &[&Request]) -> Result<Vec<Done>, BackendError> {
+        let done = submit(self.context, self.units, requests, self.control)?;
+        if requests[0].kind().shares_pace()
+            && let Some(pace) = done.first().and_then(|done| done.pace)
+        {
+            *locked(&self.batch.pace) = Some(pace);
+        }
+        Ok(done)
     }
 }
 
@@ -218,7 +153,6 @@ fn submit<'u>(
     requests: &[&Request],
     control: &dyn Control,
 ) -> Result<Vec<Done>, BackendError> {
-    context.watchdog.check()?;
     let iterations = requests.iter().map(|request| request.steps.len());
     let iterations = iterations.max().unwrap_or(0);
     let cuts: Vec<_> = requests.iter().map(|request| request.cut).collect();

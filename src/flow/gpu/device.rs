@@ -4,6 +4,7 @@ use std::sync::{Arc, Mutex, OnceLock};
 
 use super::adapter::{Adapter, AdapterKind};
 use super::batcher::Batch;
+use super::cluster_search::ClusterSearches;
 use super::context::Context;
 use super::half::Units;
 use super::memory::GpuOptions;
@@ -22,8 +23,7 @@ pub(super) struct Device {
     pub(super) kind: AdapterKind,
     /// Whether the GPU searches clusters, if it can run their kernel.
     pub(super) searches_clusters: bool,
-    /// The kernel of the object search.
-    pub(super) clusters: Arc<OnceLock<wgpu::ComputePipeline>>,
+    pub(super) cluster_searches: Arc<ClusterSearches>,
     units: Arc<Tested<Units>>,
 }
 
@@ -89,7 +89,7 @@ impl Device {
                 adapter.name, adapter.interface, adapter.driver
             ),
             kind: adapter.kind,
-            clusters: Arc::default(),
+            cluster_searches: Arc::default(),
             units: Arc::default(),
         })
     }

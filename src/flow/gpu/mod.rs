@@ -1,8 +1,8 @@
 //! The GPU backend: the kernels of the field fit in WGSL, on any GPU that wgpu supports.
 //!
 //! Independent of the CPU backend; no type of wgpu is public. A [`Gpu`] is one opened GPU. It is
-//! cheap to clone, and each clone can fit its own pair from its own thread. Pairs that are fitted
-//! at the same time share the GPU's submissions.
+//! cheap to clone, and each clone can fit its own pair from its own thread. Pairs that are fitted, or
+//! searched for objects, at the same time share the GPU's submissions.
 
 mod adapter;
 mod allocation;
@@ -33,6 +33,7 @@ mod profile;
 mod program;
 mod request;
 mod self_test;
+mod sharing;
 #[cfg(test)]
 mod tests;
 mod tiling;

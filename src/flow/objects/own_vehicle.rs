@@ -28,7 +28,9 @@ impl Objects {
     ) -> Vec<usize> {
         let mut deskewed_by = vec![[0.0; 2]; self.clusters.len()];
         for ((&cluster, to), from) in self.cluster.iter().zip(source).zip(measured) {
-            if let Ok(index) = usize::try_from(cluster) {
+            if let Ok(index) = usize::try_from(cluster)
+                && self.clusters[index].dynamic
+            {
                 let count = self.clusters[index].points as f32;
                 for axis in 0..2 {
                     deskewed_by[index][axis] += (to[axis] - from[axis]) / count;

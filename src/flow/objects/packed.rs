@@ -140,7 +140,7 @@ impl FoundRecord {
 }
 
 /// The scene of an object search, packed for the kernel.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 #[cfg_attr(
     not(feature = "gpu"),
     expect(dead_code, reason = "only the kernel of a GPU reads it")

@@ -47,7 +47,7 @@ fn with_network_and_transform() -> impl Iterator<Item = Preset> {
 
 /// The GPU shared by the tests that leave it intact. It searches clusters, also where it is a software
 /// device.
-fn shared() -> Option<&'static Gpu> {
+pub(super) fn shared() -> Option<&'static Gpu> {
     static SHARED: OnceLock<Option<Gpu>> = OnceLock::new();
     let options = GpuOptions {
         lanes: SHARED_LANES,

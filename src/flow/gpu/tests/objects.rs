@@ -1,6 +1,7 @@
 //! The object search with its clusters searched on the GPU, compared with the host's search.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::thread;
 
 use super::shared;
 use super::whole::{end_point_error, solved};
@@ -92,6 +93,28 @@ fn a_card_searches_neighbor_sweeps_as_the_host_does() {
     assert_eq!(card.device, gpu.name());
     let alike = agreement(&card.flow, &host.flow);
     assert!(alike > ALIKE, "{alike}");
+}
+
+#[test]
+fn clusters_of_pairs_that_are_searched_together_have_the_bits_of_those_of_a_pair_alone() {
+    const PAIRS: u64 = 3;
+    let Some(gpu) = shared() else {
+        return;
+    };
+    let options = Preset::Default.options(None);
+    let pairs: Vec<SimulatedPair> = (3..3 + PAIRS).map(|seed| street(seed).1).collect();
+    let found = |pair: &SimulatedPair| solved(gpu, pair, &options).flow;
+    let alone: Vec<Vec<Point>> = pairs.iter().map(found).collect();
+    let together: Vec<Vec<Point>> = thread::scope(|scope| {
+        let found = &found;
+        let threads: Vec<_> = pairs
+            .iter()
+            .map(|pair| scope.spawn(move || found(pair)))
+            .collect();
+        let joined = threads.into_iter();
+        joined.map(|pair| pair.join().expect("no panic")).collect()
+    });
+    assert_eq!(together, alone);
 }
 
 #[test]

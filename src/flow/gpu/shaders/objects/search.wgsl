@@ -31,7 +31,7 @@ fn search_clusters(
     for (var index = group.x; index < part.count; index += groups.x) {
         if local == 0u {
             cluster = clusters[part.first + index];
-            found.is_found = 0u;
+            found = Found();
             search.stage = STANDING;
             evaluate(standing(), scene.views);
         }
