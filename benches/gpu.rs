@@ -226,8 +226,8 @@ fn at_once(
     Ok(began.elapsed().as_secs_f64())
 }
 
-/// Whole sweeps by `default` on lanes that share the threads of the host, as in the service. Clusters are
-/// searched by the host and by the GPU, in turn.
+/// Whole sweeps by `default` on lanes that share the threads of the host, as in the service. Normals are
+/// found and clusters searched by the host and by the GPU, in turn.
 fn on_lanes(adapter: &Adapter) -> Result<(), String> {
     const COUNTS: [usize; 3] = [1, 8, 16];
     const PAIRS: usize = 3;
@@ -281,7 +281,8 @@ fn on_lanes(adapter: &Adapter) -> Result<(), String> {
     Ok(())
 }
 
-/// Object searches with their clusters searched by a few threads of the host and by the GPU, in turn.
+/// Object searches with the normals found and the clusters searched by a few threads of the host and
+/// by the GPU, in turn.
 fn objects(adapter: &Adapter) -> Result<(), String> {
     const ALIKE_M: f32 = 0.02;
     const HOST_THREADS: usize = 4;
@@ -293,7 +294,7 @@ fn objects(adapter: &Adapter) -> Result<(), String> {
     let gpu = &Gpu::open(adapter, &options).map_err(|e| e.to_string())?;
     println!("`default`, {HOST_THREADS} threads of the host\n");
     println!(
-        "| scene | points | clusters | host: clusters ms | all ms | GPU: clusters ms | all ms | alike |"
+        "| scene | points | clusters | host: clouds and clusters ms | all ms | GPU: clouds and clusters ms | all ms | alike |"
     );
     println!("|---|---|---|---|---|---|---|---|");
     let options = Preset::Default.options(None);
@@ -315,7 +316,7 @@ fn objects(adapter: &Adapter) -> Result<(), String> {
         let [host, card] = &runs;
         let ms = |runs: &[Estimate]| {
             let of = |value: &dyn Fn(&Estimate) -> f64| median(runs.iter().map(value).collect());
-            [of(&cluster_seconds), of(&|e| e.total_seconds)].map(|seconds| seconds * 1e3)
+            [of(&search_seconds), of(&|e| e.total_seconds)].map(|seconds| seconds * 1e3)
         };
         let ([host_ms, host_all_ms], [card_ms, card_all_ms]) = (ms(host), ms(card));
         let pairs = host[0].flow.iter().zip(&card[0].flow);
@@ -332,10 +333,10 @@ fn objects(adapter: &Adapter) -> Result<(), String> {
     Ok(())
 }
 
-/// Seconds of the search of all clusters.
-fn cluster_seconds(estimate: &Estimate) -> f64 {
+/// Seconds of the clouds, with the normals, and of the search of all clusters.
+fn search_seconds(estimate: &Estimate) -> f64 {
     match &estimate.solution {
-        Solution::Objects(objects) => objects.seconds.clusters,
+        Solution::Objects(objects) => objects.seconds.preparation + objects.seconds.clusters,
         Solution::Field(_) => f64::NAN,
     }
 }

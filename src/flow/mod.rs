@@ -72,7 +72,7 @@ pub use field::{Network, Snapshot, SnapshotError, TrainerState};
 pub use host::{Host, HostError};
 pub use motion::{MotionField, Residual, SampledMotion};
 pub use objects::{
-    CONFIDENT_WITHIN_M, Cluster, ClusterLabels, ConfidenceFeatures, FoundRecord, ObjectMotions,
+    CONFIDENT_WITHIN_M, Cluster, ClusterLabels, ConfidenceFeatures, FoundInScene, ObjectMotions,
     ObjectSearch, Objects, PackedScene, Probabilities, SearchClouds, SearchSeconds,
 };
 pub use options::*;

@@ -12,8 +12,8 @@ use crate::flow::motion::Residual;
 use crate::flow::objects::{ClusterDevice, Objects, PackedScene, SearchClouds, TimedPoints};
 use crate::flow::options::ObjectOptions;
 
-/// Estimates the residual motion by an object search. The device searches the clusters if it has
-/// kernels for it, and the host's threads do the rest.
+/// Estimates the residual motion by an object search. The device finds the normals and searches the
+/// clusters if it has kernels for it, and the host's threads do the rest.
 ///
 /// # Errors
 /// [`FlowError`] where the ground mask of a neighbor sweep is rejected, the control cancels, or the

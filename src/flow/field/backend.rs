@@ -7,7 +7,7 @@ use super::snapshot::TrainerState;
 use crate::flow::data::{Control, Interrupt, Point};
 use crate::flow::distance::DistanceError;
 use crate::flow::host::{Host, HostError};
-use crate::flow::objects::{FoundRecord, PackedScene};
+use crate::flow::objects::{FoundInScene, PackedScene};
 use crate::flow::options::{FieldOptions, LossOptions};
 
 /// A device that prepares targets, fits fields to them and evaluates fitted networks.
@@ -16,7 +16,7 @@ pub trait Backend: Send + Sync {
     fn name(&self) -> String;
 
     /// The host's thread pool. Registration and the object search run there on every device, but for
-    /// the clusters of [`Self::searches_clusters`].
+    /// the normals and the clusters of [`Self::searches_clusters`].
     fn host(&self) -> &Host;
 
     /// Whether the host's threads compute the fits. They are the reference that the self-test of
@@ -25,13 +25,13 @@ pub trait Backend: Send + Sync {
         false
     }
 
-    /// Whether the device searches the clusters of an object search, instead of the host's threads.
+    /// Whether the device finds the normals and searches the clusters of an object search, instead of
+    /// the host's threads.
     fn searches_clusters(&self) -> bool {
         false
     }
 
-    /// Searches the clusters of a scene in their order, until `is_over` is true. Returns what was
-    /// found of the first ones.
+    /// Finds the normals of a scene, and searches its clusters in their order until `is_over` is true.
     ///
     /// # Errors
     /// [`BackendError::Unsupported`] on a device that searches none. [`BackendError::Memory`],
@@ -41,7 +41,7 @@ pub trait Backend: Send + Sync {
         &self,
         scene: &PackedScene,
         is_over: &dyn Fn() -> bool,
-    ) -> Result<Vec<FoundRecord>, BackendError> {
+    ) -> Result<FoundInScene, BackendError> {
         let _nothing_is_searched = (scene, is_over);
         Err(BackendError::Unsupported("it searches no clusters"))
     }

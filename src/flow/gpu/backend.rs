@@ -16,7 +16,7 @@ use super::{distance, inference};
 use crate::flow::data::{Control, Point};
 use crate::flow::field::{Backend, BackendError, Network, PreparedTarget, Trainer};
 use crate::flow::host::Host;
-use crate::flow::objects::{FoundRecord, PackedScene};
+use crate::flow::objects::{FoundInScene, PackedScene};
 use crate::flow::options::{FieldOptions, LossOptions};
 
 /// How often a device that is destroyed is asked whether what was submitted has ended: for a second.
@@ -136,7 +136,7 @@ impl Backend for Gpu {
         &self,
         scene: &PackedScene,
         is_over: &dyn Fn() -> bool,
-    ) -> Result<Vec<FoundRecord>, BackendError> {
+    ) -> Result<FoundInScene, BackendError> {
         let Device { context, kind, .. } = &*self.0;
         self.0
             .cluster_searches

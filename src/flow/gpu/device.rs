@@ -21,7 +21,7 @@ pub(super) struct Device {
     pub(super) host: Host,
     pub(super) name: String,
     pub(super) kind: AdapterKind,
-    /// Whether the GPU searches clusters, if it can run their kernel.
+    /// Whether the GPU finds normals and searches clusters, if it can run the kernels.
     pub(super) searches_clusters: bool,
     pub(super) cluster_searches: Arc<ClusterSearches>,
     units: Arc<Tested<Units>>,

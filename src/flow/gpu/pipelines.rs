@@ -64,6 +64,12 @@ pub(super) const SOURCES: [(&str, &str); 18] = [
     ("multiply_adds", source!("multiply_adds")),
 ];
 
+/// Entry point and source of the kernel that fits planes to the points of an object search.
+pub(super) const NORMALS_SOURCE: (&str, &str) = (
+    "find_normals",
+    source!("objects/records", "objects/index", "objects/normals"),
+);
+
 /// Entry point and source of the kernel that searches clusters.
 pub(super) const CLUSTER_SOURCE: (&str, &str) = (
     "search_clusters",

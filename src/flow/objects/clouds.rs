@@ -78,14 +78,16 @@ pub(super) struct TargetCloud {
     pub(super) points: Vec<Point>,
     /// The points with scaled heights.
     pub(super) low: Vec<Point>,
-    /// Unit normals of the points; zero where the surface is not flat.
-    pub(super) normals: Vec<Point>,
+    /// Index of `points`, until their normals are known.
+    upright: Option<ColumnIndex>,
+    /// Unit normals of the points, if they are known; zero where the surface is not flat.
+    pub(super) normals: Option<Vec<Point>>,
     /// Index of `low` for static matches.
     pub(super) near: ColumnIndex,
 }
 
 impl TargetCloud {
-    /// Downsamples `target`, metres in the target's frame.
+    /// Downsamples `target`, metres in the target's frame. Its normals are not known yet.
     pub(super) fn new(target: &[Point], options: &ObjectOptions) -> Self {
         let mut points: Vec<Point> = voxel_first(target, options.voxel_m)
             .into_iter()
@@ -97,14 +99,21 @@ impl TargetCloud {
             upright = ColumnIndex::sorted(&mut points, column_m(options));
         }
         let low: Vec<Point> = points.iter().map(|&p| lowered(p, options)).collect();
-        let normals = points
-            .par_iter()
-            .map(|&point| normal(&upright, point, options));
         Self {
-            normals: normals.collect(),
+            upright: Some(upright),
+            normals: None,
             near: ColumnIndex::new(&low, 2.0 * options.static_match_m),
             points,
             low,
+        }
+    }
+
+    /// Fits a plane to the points around each point, once.
+    pub(super) fn find_normals(&mut self, options: &ObjectOptions) {
+        if let Some(upright) = self.upright.take() {
+            let points = self.points.par_iter();
+            let normals = points.map(|&point| normal(&upright, point, options));
+            self.normals = Some(normals.collect());
         }
     }
 }

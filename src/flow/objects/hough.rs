@@ -26,6 +26,11 @@ pub(super) struct TranslationVotes {
     within_m: f32,
 }
 
+/// Bins on each side of the zero translation.
+pub(super) fn half_bins(options: &ObjectOptions) -> i32 {
+    (options.max_displacement_m / options.bin_m) as i32
+}
+
 impl TranslationVotes {
     /// For translations to `target`.
     pub(super) fn new(target: &TargetCloud, options: &ObjectOptions) -> Self {
@@ -42,7 +47,7 @@ impl TranslationVotes {
         Self {
             near: ColumnIndex::new(&points, max_displacement_m / 3.0),
             bin_m,
-            half: (max_displacement_m / bin_m) as i32,
+            half: half_bins(options),
             within_m: bin_m * LEVEL_BINS,
         }
     }

@@ -41,10 +41,12 @@ pub use describe::{Cluster, Objects};
 pub use features::ConfidenceFeatures;
 pub use labels::ClusterLabels;
 pub use motion_field::ObjectMotions;
-pub use packed::{FoundRecord, PackedScene};
+pub use packed::{FoundInScene, PackedScene};
 pub use search::{ObjectSearch, SearchClouds, SearchSeconds};
 
 pub(crate) use measured_at::TimedPoints;
+#[cfg(feature = "gpu")]
+pub(crate) use packed::FoundRecord;
 pub(crate) use search::{ClusterDevice, find_objects};
 
 #[cfg(test)]

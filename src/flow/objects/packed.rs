@@ -3,9 +3,10 @@
 
 use bytemuck::{Pod, Zeroable};
 
+use super::clouds::TargetCloud;
 use super::cluster_cost::Cost;
 use super::evidence::NeighborEvidence;
-use super::hough::TranslationVotes;
+use super::hough::{self, TranslationVotes};
 use super::hypothesis::Hypothesis;
 use super::neighbor_view::NeighborView;
 use super::planar_motion::PlanarMotion;
@@ -55,6 +56,8 @@ pub(crate) struct SceneRecord {
     pub(crate) initial_guesses: u32,
     pub(crate) height_weight: f32,
     pub(crate) match_m: f32,
+    pub(crate) normal_base_m: f32,
+    pub(crate) normal_slope: f32,
     pub(crate) tangential_weight: f32,
     pub(crate) truncation_m: f32,
     pub(crate) close_fit_m: f32,
@@ -87,7 +90,7 @@ pub(crate) struct ClusterRecord {
 /// What the search of a cluster found.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
 #[repr(C)]
-pub struct FoundRecord {
+pub(crate) struct FoundRecord {
     pub(crate) still_forward: f32,
     pub(crate) still_backward: f32,
     pub(crate) is_found: u32,
@@ -139,6 +142,16 @@ impl FoundRecord {
     }
 }
 
+/// What the search of a scene found.
+#[derive(Clone, Debug, Default)]
+pub struct FoundInScene {
+    /// What was found of the first clusters.
+    pub(crate) clusters: Vec<FoundRecord>,
+    /// Unit normals of the target points, in the order of the views and of their points; zero where
+    /// the surface is not flat.
+    pub(crate) normals: Vec<[f32; 4]>,
+}
+
 /// The scene of an object search, packed for the kernel.
 #[derive(Clone, Debug)]
 #[cfg_attr(
@@ -148,8 +161,11 @@ impl FoundRecord {
 pub struct PackedScene {
     /// Tiles, columns and rows; records hold offsets into them.
     pub(crate) words: Vec<u32>,
-    /// Points and normals; records hold offsets into them.
+    /// Points; records hold offsets into them.
     pub(crate) points: Vec<[f32; 4]>,
+    /// Number of target points of all views, and of the view with the most.
+    pub(crate) targets: usize,
+    pub(crate) most_targets: usize,
     pub(crate) scene: SceneRecord,
     pub(crate) views: Vec<ViewRecord>,
     /// The clusters, large ones first.
@@ -157,23 +173,22 @@ pub struct PackedScene {
 }
 
 impl PackedScene {
-    /// Packs the target `scene`, the `neighbors` and the clusters in the given `order`. None where
-    /// the options or the sweeps exceed the limits of the kernel.
+    /// Whether the options and the target with the neighbor sweeps are within the limits of the kernel.
+    pub(super) fn fits(sweeps: &[TargetCloud], options: &ObjectOptions) -> bool {
+        sweeps.len() <= MOST_VIEWS
+            && sweeps.iter().all(|sweep| sweep.points.len() <= MOST_POINTS)
+            && options.initial_guesses <= MOST_GUESSES
+            && hough::half_bins(options) <= MOST_BINS
+    }
+
+    /// Packs the target `scene`, the `neighbors` and the clusters in the given `order`.
     pub(super) fn new(
         scene: &Scene<'_>,
         neighbors: &[NeighborView<'_>],
         votes: &TranslationVotes,
         order: &[u32],
-    ) -> Option<Self> {
+    ) -> Self {
         let options = scene.options;
-        let scenes = || std::iter::once(scene).chain(neighbors.iter().map(|n| &n.scene));
-        let fits = neighbors.len() < MOST_VIEWS
-            && scenes().all(|scene| scene.target.len() <= MOST_POINTS)
-            && options.initial_guesses <= MOST_GUESSES
-            && votes.half() <= MOST_BINS;
-        if !fits {
-            return None;
-        }
         let (mut words, mut points) = (Vec::new(), Vec::new());
         let source = scene.source;
         let rows = source.near.rows();
@@ -197,14 +212,18 @@ impl PackedScene {
         for (scene, _) in &views {
             words.extend(bits(scene.statics()));
         }
+        let (mut targets, mut most_targets) = (0, 0);
         let view_records = views.iter().map(|&(scene, (at, weight))| {
             let [free, taken] = scene.indices();
+            let normals = targets as u32;
+            targets += scene.target.len();
+            most_targets = most_targets.max(scene.target.len());
             let unlabelled = std::iter::repeat(0);
             ViewRecord {
                 free: free.write_words(unlabelled, &mut words, &mut points),
                 taken: taken.write_words(scene.owners(), &mut words, &mut points),
                 targets: write_points(&mut points, &scene.target),
-                normals: write_points(&mut points, scene.normals()),
+                normals,
                 at,
                 weight,
             }
@@ -227,13 +246,15 @@ impl PackedScene {
             record
         });
         let clusters = clusters.collect();
-        Some(Self {
+        Self {
             words,
             points,
+            targets,
+            most_targets,
             scene: record,
             views: view_records,
             clusters,
-        })
+        }
     }
 }
 
@@ -247,6 +268,8 @@ fn scene_record(options: &ObjectOptions, votes: &TranslationVotes) -> SceneRecor
         initial_guesses: options.initial_guesses as u32,
         height_weight: options.height_weight,
         match_m: options.match_m,
+        normal_base_m: options.normal_m[0],
+        normal_slope: options.normal_m[1],
         tangential_weight: options.tangential_weight,
         truncation_m: options.truncation_m,
         close_fit_m: options.close_fit_m,
@@ -288,7 +311,7 @@ fn bits(flags: &[bool]) -> impl Iterator<Item = u32> {
 /// The constants that the kernel has as well: its name of each, and the value here.
 #[cfg(test)]
 pub(crate) fn shared_constants() -> Vec<(&'static str, f32)> {
-    use super::{gauss_newton, hough, hypothesis};
+    use super::{gauss_newton, hypothesis};
     let [guess_steps, last_steps] = hypothesis::STEPS;
     let [coarse_m, fine_m] = gauss_newton::SCALES_M;
     let [shift_damping, turn_damping] = gauss_newton::DAMPING;

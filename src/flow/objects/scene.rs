@@ -20,7 +20,7 @@ pub(super) struct Scene<'a> {
     pub(super) source: &'a SourceCloud,
     /// Target points, one a voxel, metres: those of `free`, then those of `taken`.
     pub(super) target: Vec<Point>,
-    /// Unit normals of the target points; zero where the surface is not flat.
+    /// Unit normals of the target points; zero where the surface is not flat or not known.
     normals: Vec<Point>,
     /// Index of the target points that are no static match, with scaled heights.
     free: ColumnIndex,
@@ -58,7 +58,10 @@ impl<'a> Scene<'a> {
             options,
             source,
             target: in_order(&target.points),
-            normals: in_order(&target.normals),
+            normals: match &target.normals {
+                Some(normals) => in_order(normals),
+                None => vec![[0.0; 3]; target.points.len()],
+            },
             free,
             owners: taken.slot_labels(&owners),
             taken,
@@ -101,9 +104,11 @@ impl<'a> Scene<'a> {
         &self.is_static
     }
 
-    /// Unit normals of the target points; zero where the surface is not flat.
-    pub(super) fn normals(&self) -> &[Point] {
-        &self.normals
+    /// Takes the normals of its target points from those of several scenes.
+    pub(super) fn take_normals(&mut self, of_all: &mut impl Iterator<Item = Point>) {
+        for (normal, found) in self.normals.iter_mut().zip(of_all) {
+            *normal = found;
+        }
     }
 
     /// Whether some static matches may be those of `cluster`.

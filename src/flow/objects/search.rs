@@ -16,7 +16,7 @@ use super::hypothesis::Hypothesis;
 use super::labels::ClusterLabels;
 use super::motion_field::ObjectMotions;
 use super::neighbor_view::NeighborView;
-use super::packed::{FoundRecord, PackedScene};
+use super::packed::{ClusterRecord, FoundInScene, PackedScene};
 use super::scene::Scene;
 use super::{accept, assign, features, free_space};
 use crate::flow::data::AlignedSweep;
@@ -32,6 +32,9 @@ const SCENES: f64 = 0.3;
 /// Expected time of the stages after the cluster searches, relative to that of all before them: 0.6
 /// to 1, the latter with a million points.
 const REST: f64 = 1.0;
+/// Factor on both where a device finds the normals. They take a third to a half of the host's time to
+/// prepare the clouds.
+const WITHOUT_NORMALS: f64 = 2.0;
 
 /// The clouds of an object search, metres.
 #[derive(Clone, Copy, Debug)]
@@ -92,7 +95,7 @@ pub struct ObjectSearch {
 pub struct SearchSeconds {
     /// Clustering, downsampling, normals, rays, and the indices of the clouds.
     pub preparation: f64,
-    /// The search of all clusters.
+    /// The search of all clusters. Where a device searches them, also the normals.
     pub clusters: f64,
     /// The assignment of motions to clusters and points, and their confidence features.
     pub assignment: f64,
@@ -130,9 +133,10 @@ impl ObjectSearch {
     }
 }
 
-/// Searches the clusters of a scene, the first ones first, until the second argument is true.
+/// Finds the normals of a scene and searches its clusters, the first ones first, until the second
+/// argument is true.
 pub(crate) type ClusterDevice<'a, E> =
-    dyn Fn(&PackedScene, &dyn Fn() -> bool) -> Result<Vec<FoundRecord>, E> + Sync + 'a;
+    dyn Fn(&PackedScene, &dyn Fn() -> bool) -> Result<FoundInScene, E> + Sync + 'a;
 
 /// Searches `clouds` for moving objects. Large clusters are searched first, by `device` if there is
 /// one whose limits the options keep. Clusters that were not searched because `control` interrupted
@@ -160,50 +164,70 @@ pub(crate) fn find_objects<E: Send>(
         let sweeps =
             std::iter::once(target).chain(clouds.neighbors.iter().map(|sweep| &sweep.points[..]));
         let sweeps: Vec<&[Point]> = sweeps.collect();
-        sweeps
-            .par_iter()
-            .map(|sweep| TargetCloud::new(sweep, options))
-            .collect()
+        let prepared = sweeps.par_iter().map(|sweep| {
+            let mut cloud = TargetCloud::new(sweep, options);
+            if device.is_none() {
+                cloud.find_normals(options);
+            }
+            cloud
+        });
+        prepared.collect()
     };
     let free_space = || FreeSpace::new(clouds.sweeps, clouds.times, &clouds.target_from_source);
-    let ((labels, downsampled), (others, free_space)) =
+    let ((labels, downsampled), (mut others, free_space)) =
         rayon::join(clustered, || rayon::join(others, free_space));
+    let fits = || !downsampled.members.is_empty() && PackedScene::fits(&others, options);
+    // A buffer of no clusters cannot be bound.
+    let on_device = device.filter(|_| fits());
+    if on_device.is_none() {
+        let others = others.par_iter_mut();
+        others.for_each(|cloud| cloud.find_normals(options));
+    }
+    let margin = on_device.map_or(1.0, |_| WITHOUT_NORMALS);
     let clouds_seconds = control.seconds() - began;
-    if let Some(interrupt) = out_of_time(control, clouds_seconds * SCENES) {
+    if let Some(interrupt) = out_of_time(control, clouds_seconds * SCENES * margin) {
         return Ok(ObjectSearch::nothing(interrupt));
     }
-    let (scene, votes) = rayon::join(
+    let (mut scene, votes) = rayon::join(
         || Scene::new(&downsampled, &others[0], options),
         || TranslationVotes::new(&others[0], options),
     );
-    let neighbors: Vec<NeighborView<'_>> = clouds
+    let mut neighbors: Vec<NeighborView<'_>> = clouds
         .neighbors
         .par_iter()
         .zip(&others[1..])
         .map(|(sweep, cloud)| NeighborView::new(&downsampled, sweep, cloud, options))
         .collect();
     let prepared_at = control.seconds();
-    let rest = (prepared_at - began) * REST;
-
+    let rest = (prepared_at - began) * REST * margin;
+    let order = large_first(&downsampled);
+    let found = on_device.map(|device| {
+        let packed = PackedScene::new(&scene, &neighbors, &votes, &order);
+        let found = device(&packed, &|| out_of_time(control, rest).is_some())?;
+        Ok((packed.clusters, found))
+    });
+    let found = found.transpose()?;
+    if let Some((_, found)) = &found {
+        let mut normals = found.normals.iter().map(|&[x, y, z, _]| [x, y, z]);
+        scene.take_normals(&mut normals);
+        for neighbor in &mut neighbors {
+            neighbor.scene.take_normals(&mut normals);
+        }
+    }
     let views = Views {
         scene: &scene,
         neighbors: &neighbors,
         free_space: &free_space,
         votes: &votes,
     };
-    let order = views.large_first();
-    let packed = device.and_then(|device| {
-        let packed = PackedScene::new(&scene, &neighbors, &votes, &order)?;
-        Some((device, packed))
-    });
-    let on_device = packed.is_some();
+    let on_device = found.is_some();
     let Progressed {
         searched,
         clusters,
         interrupted,
         ..
-    } = match packed {
-        Some((device, packed)) => search_on(device, &packed, &views, rest, control)?,
+    } = match found {
+        Some((clusters, found)) => judge_all(&views, &clusters, &found, rest, control),
         None => search_all(&views, &order, rest, control),
     };
     let costs = searched.iter().flatten();
@@ -261,14 +285,12 @@ struct Views<'a> {
     votes: &'a TranslationVotes,
 }
 
-impl Views<'_> {
-    /// The clusters in the order in which they are searched.
-    fn large_first(&self) -> Vec<u32> {
-        let members = &self.scene.source.members;
-        let mut order: Vec<u32> = (0..members.len() as u32).collect();
-        order.sort_by_key(|&cluster| std::cmp::Reverse(members[cluster as usize].len()));
-        order
-    }
+/// The clusters in the order in which they are searched.
+fn large_first(source: &SourceCloud) -> Vec<u32> {
+    let members = &source.members;
+    let mut order: Vec<u32> = (0..members.len() as u32).collect();
+    order.sort_by_key(|&cluster| std::cmp::Reverse(members[cluster as usize].len()));
+    order
 }
 
 /// The clusters as searched so far.
@@ -315,32 +337,31 @@ fn out_of_time(control: &dyn Control, needed: f64) -> Option<Interrupt> {
     control.interrupt().or(late.then_some(Interrupt::Deadline))
 }
 
-/// Searches all clusters on a device, as long as `rest` seconds are left for what follows. The host
-/// judges what it finds.
-fn search_on<E>(
-    device: &ClusterDevice<'_, E>,
-    packed: &PackedScene,
+/// Judges what a device found of the first `clusters`. It ended before all were searched where less than
+/// `rest` seconds were left for what follows.
+fn judge_all(
     views: &Views<'_>,
+    clusters: &[ClusterRecord],
+    found: &FoundInScene,
     rest: f64,
     control: &dyn Control,
-) -> Result<Progressed, E> {
-    let is_over = || out_of_time(control, rest).is_some();
-    let found = device(packed, &is_over)?;
-    let all = packed.clusters.par_iter().zip(&found);
+) -> Progressed {
+    let all = clusters.par_iter().zip(&found.clusters);
     let judged = all.map(|(cluster, found)| {
         let (still, best) = found.unpacked(cluster);
         let mover = ClusterSearch::new(views.scene, views.neighbors, cluster.label);
         judged(views, &mover, still, best)
     });
     let judged: Vec<SearchedCluster> = judged.collect();
-    let mut progressed = Progressed::none(packed.clusters.len());
-    for (cluster, found) in packed.clusters.iter().zip(judged) {
+    let is_whole = judged.len() == clusters.len();
+    let mut progressed = Progressed::none(clusters.len());
+    for (cluster, found) in clusters.iter().zip(judged) {
         progressed.add(cluster.label, found, control);
     }
-    if found.len() < packed.clusters.len() {
+    if !is_whole {
         progressed.interrupted = out_of_time(control, rest).or(Some(Interrupt::Deadline));
     }
-    Ok(progressed)
+    progressed
 }
 
 /// Searches all clusters in `order` on the host's threads, as long as `rest` seconds are left for what

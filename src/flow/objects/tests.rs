@@ -5,6 +5,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use nalgebra::Point3;
 
+use super::packed::{FoundInScene, PackedScene};
 use super::search::{ObjectSearch, SearchClouds, find_objects};
 use crate::flow::data::{Control, Interrupt, Point, Random, RigidTransform, Uncontrolled};
 use crate::flow::options::ObjectOptions;
@@ -239,4 +240,35 @@ fn an_interrupt_keeps_what_was_found_until_then() {
     let control = After(3, Interrupt::Cancelled, AtomicUsize::new(0));
     let search = searched(&clouds(&source, &target), &control);
     assert_eq!(search.interrupted, Some(Interrupt::Cancelled));
+}
+
+#[test]
+fn a_device_is_not_asked_for_what_it_cannot_search() {
+    let ask = |_: &PackedScene, _: &dyn Fn() -> bool| Err::<FoundInScene, ()>(());
+    let mut random = Random::new(6);
+    let [source, target] = [0.0, 0.8].map(|x| car(&mut random, [8.0 + x, 0.0]));
+    let scattered: Vec<Point> = (0..20_u8).map(|i| [f32::from(i) * 3.0, 5.0, 0.0]).collect();
+    let guesses = |initial_guesses: usize| ObjectOptions {
+        initial_guesses,
+        ..ObjectOptions::default()
+    };
+    let usual = ObjectOptions::default().initial_guesses;
+    // It could search the first: that shows that it is asked.
+    for (points, guesses, is_asked) in [
+        (&source, guesses(usual), true),
+        (&source, guesses(17), false),
+        (&scattered, guesses(usual), false),
+    ] {
+        let clouds = clouds(points, &target);
+        let on_device = find_objects(&clouds, &guesses, Some(&ask), &Uncontrolled);
+        assert_eq!(on_device.is_err(), is_asked);
+        if let Ok(found) = on_device {
+            let on_host: Result<_, Infallible> =
+                find_objects(&clouds, &guesses, None, &Uncontrolled);
+            let expected = on_host.unwrap_or_else(|never| match never {});
+            assert!(!found.on_device);
+            assert_eq!(found.evidence, expected.evidence);
+            assert_eq!(found.residual_of(points), expected.residual_of(points));
+        }
+    }
 }

@@ -16,4 +16,6 @@ pub(crate) use column_kernels::around;
 pub(crate) use dbscan::NOISE;
 pub(crate) use index_words::IndexRecord;
 pub(crate) use plane::PlaneFit;
+#[cfg(test)]
+pub(crate) use plane::constants_of_planes;
 pub(crate) use voxel::{voxel_first, voxel_mean};

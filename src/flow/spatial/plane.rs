@@ -5,12 +5,12 @@ use nalgebra::{Matrix3, Vector3};
 use super::neighborhood::Neighborhood;
 
 /// Least number of points, the center included, for a plane.
-const NEIGHBORS: f64 = 4.0;
+const LEAST_POINTS: f64 = 4.0;
 /// Flatness threshold: the variance along the second axis must exceed that along the normal by this
 /// share of the variance along the first axis. Less flat neighborhoods are branches and wires. With
 /// a higher threshold, walls hit by a single ring are lost.
 const FLAT: f64 = 0.05;
-/// What is added to the thickness of a plane of [`NEIGHBORS`] points. It falls with the fifth power of
+/// What is added to the thickness of a plane of [`LEAST_POINTS`] points. It falls with the fifth power of
 /// their number: four points of one ring around a corner lie on a plane that is no surface.
 const UNCERTAIN: f32 = 1.2;
 /// Variances below this count as zero, square metres.
@@ -32,7 +32,7 @@ impl Neighborhood {
     /// The plane of the points; none where there are fewer than four, or where they do not lie on a
     /// plane.
     pub(super) fn flat(&self) -> Option<PlaneFit> {
-        if self.count < NEIGHBORS {
+        if self.count < LEAST_POINTS {
             return None;
         }
         let mean = Vector3::from(self.sum) / self.count;
@@ -40,7 +40,7 @@ impl Neighborhood {
         let squares = Matrix3::new(xx, xy, xz, xy, yy, yz, xz, yz, zz);
         let mean_square = squares / self.count;
         let mut plane = flat(&(mean_square - mean * mean.transpose()))?;
-        plane.thickness += UNCERTAIN * (NEIGHBORS / self.count).powi(5) as f32;
+        plane.thickness += UNCERTAIN * (LEAST_POINTS / self.count).powi(5) as f32;
         Some(plane)
     }
 }
@@ -76,4 +76,14 @@ fn flat(spread: &Matrix3<f64>) -> Option<PlaneFit> {
         thickness: (least / middle).max(0.0) as f32,
         variance: least.max(0.0) as f32,
     })
+}
+
+/// The constants that the kernel of a GPU has as well: its name of each, and the value here.
+#[cfg(test)]
+pub(crate) fn constants_of_planes() -> [(&'static str, f32); 3] {
+    [
+        ("LEAST_POINTS", LEAST_POINTS as f32),
+        ("FLAT", FLAT as f32),
+        ("NO_SPREAD", NO_SPREAD as f32),
+    ]
 }

@@ -36,6 +36,14 @@ fn agreement(a: &[Point], b: &[Point]) -> f64 {
     alike.count() as f64 / a.len() as f64
 }
 
+/// For each point the probability that its flow is right.
+fn confidence(estimate: &Estimate) -> &[f32] {
+    match &estimate.solution {
+        Solution::Objects(objects) => &objects.objects.confidence,
+        Solution::Field(_) => &[],
+    }
+}
+
 /// Number of clusters that were searched.
 fn searched(estimate: &Estimate) -> usize {
     match &estimate.solution {
@@ -93,6 +101,12 @@ fn a_card_searches_neighbor_sweeps_as_the_host_does() {
     assert_eq!(card.device, gpu.name());
     let alike = agreement(&card.flow, &host.flow);
     assert!(alike > ALIKE, "{alike}");
+    // It depends on the distances along the normals.
+    let [of_card, of_host] = [&card, &host].map(confidence);
+    assert_eq!(of_card.len(), of_host.len());
+    let both = of_card.iter().zip(of_host);
+    let alike = both.filter(|(a, b)| (*a - *b).abs() < 0.01).count() as f64;
+    assert!(alike > ALIKE * of_host.len() as f64, "{alike}");
 }
 
 #[test]

@@ -4,11 +4,11 @@ use core::mem::offset_of;
 
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 
-use crate::flow::gpu::cluster_search::{GROUP, GROUP_BYTES, Part};
+use crate::flow::gpu::cluster_search::{GROUP, GROUP_BYTES, NORMALS_GROUP, Part};
 use crate::flow::gpu::layout;
-use crate::flow::gpu::pipelines::{CLUSTER_SOURCE, HALF_SOURCES, SOURCES};
+use crate::flow::gpu::pipelines::{CLUSTER_SOURCE, HALF_SOURCES, NORMALS_SOURCE, SOURCES};
 use crate::flow::objects::{ClusterRecord, FoundRecord, SceneRecord, ViewRecord, shared_constants};
-use crate::flow::spatial::IndexRecord;
+use crate::flow::spatial::{IndexRecord, constants_of_planes};
 
 fn parsed(name: &str, source: &str) -> naga::Module {
     naga::front::wgsl::parse_str(source)
@@ -24,7 +24,7 @@ fn every_shader_is_valid_and_fits_the_smallest_workgroup_memory() {
         | Capabilities::COOPERATIVE_MATRIX;
     let single = SOURCES
         .into_iter()
-        .chain([CLUSTER_SOURCE])
+        .chain([NORMALS_SOURCE, CLUSTER_SOURCE])
         .map(|kernel| (kernel, Capabilities::IMMEDIATES));
     let half = HALF_SOURCES
         .as_flattened()
@@ -110,7 +110,7 @@ fn host_and_cluster_kernel_agree_on_every_record() {
     same_cluster_layout!("View", ViewRecord: free, taken, targets, normals, at, weight);
     same_cluster_layout!("Scene", SceneRecord: source, positions, rows, statics, static_words, voted, views,
         scratch_words, half_bins, bin_m, vote_within_m, cluster_min_points, initial_guesses,
-        height_weight, match_m, tangential_weight, truncation_m, close_fit_m, displacement_penalty, static_fit_m,
+        height_weight, match_m, normal_base_m, normal_slope, tangential_weight, truncation_m, close_fit_m, displacement_penalty, static_fit_m,
         min_motion_m, min_gain_m, max_cost_ratio, min_evidence_m, min_evidence_slope, max_residual_m, min_normal_motion_m,
         neighbor_cost_ratio, neighbor_gain_m, slow_cost_ratio, slow_gain_m);
     same_cluster_layout!("Cluster", ClusterRecord: label, members, count, center_x, center_y);
@@ -126,6 +126,12 @@ fn host_and_cluster_kernel_agree_on_every_constant() {
     assert_eq!(number(source, "GROUP"), GROUP as f32);
     for (name, value) in shared_constants() {
         assert_eq!(number(source, name), value, "{name}");
+    }
+    let normals = parsed(NORMALS_SOURCE.0, NORMALS_SOURCE.1);
+    let [invocations, ..] = normals.entry_points[0].workgroup_size;
+    assert_eq!(invocations as usize, NORMALS_GROUP);
+    for (name, value) in constants_of_planes() {
+        assert_eq!(number(NORMALS_SOURCE.1, name), value, "{name}");
     }
 }
 

@@ -2,6 +2,11 @@
 // the normal equations of a step, or how its surfaces determine it. Mirrors ClusterSearch, Sums and
 // the matches of Scene.
 
+@group(0) @binding(4) var<storage, read> normals: array<vec4<f32>>;
+@group(0) @binding(5) var<storage, read> clusters: array<Cluster>;
+@group(0) @binding(6) var<storage, read_write> scratch: array<atomic<u32>>;
+@group(0) @binding(7) var<storage, read_write> results: array<Found>;
+
 const COST = 0u;
 const FIT = 1u;
 const SURFACES = 2u;
@@ -255,7 +260,7 @@ fn measure(local: u32) {
         if is_matched {
             let moved = applied(map, start);
             let target_point = points[views[view].targets + to].xyz;
-            let normal = points[views[view].normals + to].xyz;
+            let normal = normals[views[view].normals + to].xyz;
             distance = distance_to(moved, target_point, normal);
             if kind == FIT {
                 add_match(&terms, moved, target_point, normal);

@@ -1,5 +1,5 @@
 // The records of the object search. PackedScene of flow/objects has the same; a test compares their
-// offsets. Offsets of points are into `points`; all others are into `words`.
+// offsets. Offsets of points are into `points`, those of normals into `normals`; all others are into `words`.
 
 // A column index: the hash table of its tiles, its columns and its points in the order of slots.
 struct Index {
@@ -22,8 +22,9 @@ struct Index {
 struct View {
     free: Index,
     taken: Index,
-    // Points and normals of the slots of `free`, then of those of `taken`. Heights are not scaled.
+    // The points of the slots of `free`, then of those of `taken`. Heights are not scaled.
     targets: u32,
+    // Their normals, an offset into `normals`.
     normals: u32,
     // Sweep intervals after the source.
     at: i32,
@@ -54,6 +55,8 @@ struct Scene {
     initial_guesses: u32,
     height_weight: f32,
     match_m: f32,
+    normal_base_m: f32,
+    normal_slope: f32,
     tangential_weight: f32,
     truncation_m: f32,
     close_fit_m: f32,
@@ -114,20 +117,10 @@ struct Found {
     agree: u32,
 }
 
-struct Part {
-    // Index of the first cluster of this dispatch, and the number of clusters.
-    first: u32,
-    count: u32,
-}
-
-var<immediate> part: Part;
 @group(0) @binding(0) var<storage, read> words: array<u32>;
 @group(0) @binding(1) var<storage, read> scene: Scene;
 @group(0) @binding(2) var<storage, read> views: array<View>;
-@group(0) @binding(3) var<storage, read> clusters: array<Cluster>;
-@group(0) @binding(4) var<storage, read_write> scratch: array<atomic<u32>>;
-@group(0) @binding(5) var<storage, read_write> results: array<Found>;
-@group(0) @binding(6) var<storage, read> points: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read> points: array<vec4<f32>>;
 
 // Invocations of a workgroup, which searches one cluster at a time.
 const GROUP = 512u;

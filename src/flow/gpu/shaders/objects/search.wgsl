@@ -1,6 +1,14 @@
 // The search for the motion of a cluster: mirrors ClusterSearch::search. One workgroup searches one
 // cluster at a time. Its first invocation decides what is measured next; all of them measure.
 
+struct Part {
+    // Index of the first cluster of this dispatch, and the number of clusters.
+    first: u32,
+    count: u32,
+}
+
+var<immediate> part: Part;
+
 // Takes what was measured, and asks for what follows.
 fn advance() {
     switch request.kind {
