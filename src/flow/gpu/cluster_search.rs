@@ -90,8 +90,8 @@ impl ClusterSearches {
             }
         }
         // The host measures distances along them, also where no cluster was searched.
-        if found.normals.is_empty() {
-            let (normals, count) = &scene.normals;
+        let (normals, count) = &scene.normals;
+        if found.normals.len() < *count {
             let bytes = buffer_bytes::<[f32; 4]>(*count);
             found.normals = all_of(&context.finish(context.encoder(), normals, bytes)?);
         }

@@ -5,12 +5,12 @@ use std::sync::Mutex;
 use nalgebra::{Matrix3, Vector3};
 
 use super::*;
-use crate::flow::data::{AlignedSweep, RigidTransform, Uncontrolled, locked};
+use crate::flow::data::{AlignedSweep, Point, RigidTransform, Uncontrolled, locked};
 use crate::flow::gpu::tests::shared;
 use crate::flow::host::Host;
 use crate::flow::objects::SearchClouds;
 use crate::flow::options::ObjectOptions;
-use crate::flow::simulate::{Street, StreetOptions};
+use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
 
 /// The scene of a small street, with the source as the sweep before it.
 fn street(seed: u64) -> PackedScene {
@@ -21,16 +21,22 @@ fn street(seed: u64) -> PackedScene {
         ..StreetOptions::default()
     };
     let pair = Street::new(&options).and_then(|street| street.pair(0));
-    let pair = pair.expect("a street");
+    let SimulatedPair { source, target, .. } = pair.expect("a street");
+    let before = source.clone();
+    packed(&source, &target, before)
+}
+
+/// The scene of a source, a target and the sweep before the source.
+fn packed(source: &[Point], target: &[Point], before: Vec<Point>) -> PackedScene {
     let neighbors = [AlignedSweep {
-        points: pair.source.clone(),
+        points: before,
         at: -1,
     }];
     let clouds = SearchClouds {
-        source: &pair.source,
-        target: &pair.target,
+        source,
+        target,
         neighbors: &neighbors,
-        sweeps: [&pair.source, &pair.target],
+        sweeps: [source, target],
         times: None,
         target_from_source: RigidTransform::identity(),
     };
@@ -101,6 +107,21 @@ fn parts_of_scenes_in_one_submission_have_the_bits_of_each_alone() {
     waiting.push((1, uploaded[0].part(0, first)));
     assert_eq!(search.take(&mut waiting).len(), 2);
     assert_eq!(waiting.len(), 1);
+}
+
+#[test]
+fn nothing_is_found_in_sweeps_without_points() {
+    let Some(gpu) = shared() else {
+        return;
+    };
+    let device = gpu.device();
+    let points = (0..400_u16).map(|i| [f32::from(i % 20) * 0.1, f32::from(i / 20) * 0.1, 1.0]);
+    let scene = packed(&points.collect::<Vec<_>>(), &[], Vec::new());
+    let searches = &device.cluster_searches;
+    let found = searches.search(&device.context, device.kind, &scene, &|| false);
+    let found = found.expect("no error");
+    assert_eq!((found.clusters.len(), found.clusters[0].is_found), (1, 0));
+    assert!(found.normals.is_empty());
 }
 
 #[test]

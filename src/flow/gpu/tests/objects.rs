@@ -9,7 +9,7 @@ use crate::flow::cpu::CpuBackend;
 use crate::flow::data::{Control, Interrupt, Point, Uncontrolled};
 use crate::flow::estimate::{Estimate, Solution, estimate};
 use crate::flow::field::Backend;
-use crate::flow::options::{Ground, Options, Preset};
+use crate::flow::options::{Ego, Ground, Options, Preset};
 use crate::flow::problem::{NeighborSweep, Problem};
 use crate::flow::simulate::{SimulatedPair, Street, StreetOptions};
 
@@ -129,6 +129,26 @@ fn clusters_of_pairs_that_are_searched_together_have_the_bits_of_those_of_a_pair
         joined.map(|pair| pair.join().expect("no panic")).collect()
     });
     assert_eq!(together, alone);
+}
+
+#[test]
+fn clouds_without_clusters_are_left_to_the_host() {
+    let Some(gpu) = shared() else {
+        return;
+    };
+    let scattered: Vec<Point> = (0..60_u8)
+        .map(|i| [f32::from(i % 8) * 4.0, f32::from(i / 8) * 4.0, 1.0])
+        .collect();
+    let options = Options {
+        ego: Ego::Off,
+        ground: Ground::Keep,
+        ..Preset::Default.options(None)
+    };
+    let problem = Problem::pair(&scattered, &scattered);
+    let found = estimate(gpu, &problem, &options, &Uncontrolled).expect("a flow");
+    assert_eq!(searched(&found), 0);
+    assert_ne!(found.device, gpu.name());
+    assert!(gpu.device().context.watchdog.check().is_ok());
 }
 
 #[test]
