@@ -7,7 +7,7 @@
 
 use std::f32::consts::{FRAC_PI_2, PI};
 
-use crate::flow::data::{Point, RigidTransform, Screw, atan2, transform_point};
+use crate::flow::data::{Point, RigidTransform, Screw, atan2, floors, transform_point};
 
 /// Sides of the solid angles that rays are binned into, radians. Two rings of a 64-beam lidar fall
 /// into one bin.
@@ -16,6 +16,8 @@ const ELEVATION: f32 = 1.0 * PI / 180.0;
 /// Number of bins in azimuth, and in elevation from nadir to zenith.
 const AZIMUTHS: usize = 600;
 const ELEVATIONS: usize = 180;
+/// Points whose directions are computed at once.
+const AT_ONCE: usize = 16;
 /// A ray has passed a position where it ends farther out by this: metres, and metres per metre of
 /// range.
 const PASSED_M: [f32; 2] = [0.2, 0.01];
@@ -139,11 +141,17 @@ impl Rays {
     /// Rays to `points`. Points that are not finite are ignored.
     fn new(points: &[Point], columns: Option<Columns>) -> Self {
         let mut shortest_m = vec![f32::INFINITY; AZIMUTHS * ELEVATIONS];
-        for &point in points {
-            let (angle, range_m) = direction(point);
+        let mut see = |(angle, range_m): (usize, f32)| {
             if range_m >= NEAREST_M {
                 shortest_m[angle] = range_m.min(shortest_m[angle]);
             }
+        };
+        let (together, rest) = points.as_chunks::<AT_ONCE>();
+        for points in together {
+            directions(points).into_iter().for_each(&mut see);
+        }
+        for &point in rest {
+            see(direction(point));
         }
         Self {
             shortest_m,
@@ -170,12 +178,28 @@ pub(super) fn passed_m(range_m: f32) -> f32 {
 }
 
 /// The bin of a position's direction, and its range, metres.
-fn direction([x, y, z]: Point) -> (usize, f32) {
-    let square = x * x + y * y;
-    let azimuth = ((atan2(y, x) + PI) / AZIMUTH) as u32 as usize;
-    let elevation = ((atan2(z, square.sqrt()) + FRAC_PI_2) / ELEVATION) as u32 as usize;
-    let angle = azimuth.min(AZIMUTHS - 1) * ELEVATIONS + elevation.min(ELEVATIONS - 1);
-    (angle, (square + z * z).sqrt())
+fn direction(position: Point) -> (usize, f32) {
+    directions(&[position])[0]
+}
+
+/// [`direction`] of several positions, by vector instructions.
+#[inline(always)]
+fn directions<const N: usize>(positions: &[Point; N]) -> [(usize, f32); N] {
+    let (mut azimuths, mut elevations, mut ranges) = ([0.0; N], [0.0; N], [0.0; N]);
+    for (i, &[x, y, z]) in positions.iter().enumerate() {
+        let square = x * x + y * y;
+        azimuths[i] = (atan2(y, x) + PI) / AZIMUTH;
+        elevations[i] = (atan2(z, square.sqrt()) + FRAC_PI_2) / ELEVATION;
+        ranges[i] = (square + z * z).sqrt();
+    }
+    let azimuths = floors(azimuths, [0.0, (AZIMUTHS - 1) as f32]);
+    let elevations = floors(elevations, [0.0, (ELEVATIONS - 1) as f32]);
+    let mut directions = [(0, 0.0); N];
+    for (i, direction) in directions.iter_mut().enumerate() {
+        let bin = azimuths[i] * ELEVATIONS as i32 + elevations[i];
+        *direction = (bin as usize, ranges[i]);
+    }
+    directions
 }
 
 /// The share that rays passed, of the positions with rays toward them; none where there are too
