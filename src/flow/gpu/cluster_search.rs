@@ -196,7 +196,10 @@ impl Search<'_> {
         let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC;
         let scratch = context.empty(groups * scratch, wgpu::BufferUsages::STORAGE)?;
         let results = context.empty(buffer_bytes::<FoundRecord>(clusters), usage)?;
-        let normals = context.empty(buffer_bytes::<[f32; 4]>(packed.targets), usage)?;
+        let targets = packed.views.iter();
+        let targets = targets.map(|view| (view.free.count + view.taken.count) as usize);
+        let normals_count = targets.clone().sum();
+        let normals = context.empty(buffer_bytes::<[f32; 4]>(normals_count), usage)?;
         let of_normals = [&words, &scene, &views, &points, &normals];
         let of_search = [&records, &scratch, &results];
         let of_search: Vec<_> = of_normals.into_iter().chain(of_search).collect();
@@ -204,7 +207,7 @@ impl Search<'_> {
         {
             let untimed = wgpu::ComputePassDescriptor::default();
             let mut pass = encoder.begin_compute_pass(&untimed);
-            let groups = packed.most_targets.div_ceil(NORMALS_GROUP);
+            let groups = targets.max().unwrap_or(0).div_ceil(NORMALS_GROUP);
             pass.set_pipeline(&self.kernels.normals);
             pass.set_bind_group(0, &context.bound(&self.kernels.normals, &of_normals), &[]);
             pass.dispatch_workgroups(groups as u32, packed.views.len() as u32, 1);
@@ -213,7 +216,7 @@ impl Search<'_> {
         Ok(UploadedScene {
             group: context.bound(&self.kernels.search, &of_search),
             results,
-            normals: (normals, packed.targets),
+            normals: (normals, normals_count),
             groups: groups as u32,
         })
     }

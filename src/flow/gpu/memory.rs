@@ -22,8 +22,8 @@ pub struct GpuOptions {
     /// `RAYON_NUM_THREADS` if it is set, else for one thread per logical core.
     pub host_threads: Option<usize>,
     /// Threads of the host for each lane, up to which the GPU and not the host finds the normals and
-    /// searches the clusters of an object search. All lanes do the same, so that a flow does not depend on how many are at work.
-    /// None stands for four, and for zero on a software device.
+    /// searches the clusters of an object search. All lanes do the same, so that a flow does not depend
+    /// on how many are at work. None stands for four, and for zero on a software device.
     pub cluster_threads: Option<usize>,
 }
 

@@ -221,24 +221,22 @@ mod tests {
         }
     }
 
-    type Ended = Result<ControlFlow<&'static str, (u32, usize)>, BackendError>;
-
-    /// Submits 0, and the three `others` while that runs. `is_over` is asked for the others. The first
-    /// submission ends when they wait, and all later ones do at once. Returns how the others ended.
-    fn submitted_beside(
-        watchdog: &Watchdog,
-        others: [u32; 3],
-        is_over: &(dyn Fn(u32) -> Option<&'static str> + Sync),
-    ) -> [Ended; 3] {
+    /// The submissions, what tells that one begins, and what lets one end.
+    fn counted() -> (Counted, mpsc::Receiver<()>, mpsc::Sender<()>) {
         let (began, begins) = mpsc::channel();
         let (end, may_end) = mpsc::channel();
-        let how = Counted {
-            began,
-            may_end: Mutex::new(may_end),
-        };
+        let may_end = Mutex::new(may_end);
+        (Counted { began, may_end }, begins, end)
+    }
+
+    type Ended = Result<ControlFlow<(), (u32, usize)>, BackendError>;
+
+    /// Submits 0, and the three `others` while that runs. The first submission ends when they wait, and
+    /// all later ones do at once. Returns how the others ended.
+    fn submitted_beside(watchdog: &Watchdog, others: [u32; 3]) -> [Ended; 3] {
+        let (how, begins, end) = counted();
         let shared = Shared::default();
-        let run =
-            |request: u32| -> Ended { shared.run(watchdog, request, &how, &|| is_over(request)) };
+        let run = |request: u32| -> Ended { shared.run(watchdog, request, &how, &|| None) };
         let ended = thread::scope(|scope| {
             let first = scope.spawn(|| run(0));
             begins.recv().expect("a submission");
@@ -261,7 +259,7 @@ mod tests {
 
     #[test]
     fn requests_that_come_while_another_is_submitted_share_the_next_submission() {
-        let ended = submitted_beside(&Watchdog::default(), [1, 2, 3], &|_| None);
+        let ended = submitted_beside(&Watchdog::default(), [1, 2, 3]);
         for (request, ended) in (1..).zip(ended) {
             let ended = ended.expect("no error");
             assert_eq!(ended, ControlFlow::Continue((request, 3)));
@@ -270,12 +268,12 @@ mod tests {
 
     #[test]
     fn a_submission_that_fails_fails_for_each_of_its_requests_and_for_no_other() {
-        let ended = submitted_beside(&Watchdog::default(), [1, BUSY, 3], &|_| None);
+        let ended = submitted_beside(&Watchdog::default(), [1, BUSY, 3]);
         for ended in ended {
             assert!(matches!(ended, Err(BackendError::Busy)), "{ended:?}");
         }
         let watchdog = Watchdog::default();
-        let ended = submitted_beside(&watchdog, [1, PANIC, 3], &|_| None);
+        let ended = submitted_beside(&watchdog, [1, PANIC, 3]);
         for ended in ended {
             assert!(matches!(ended, Err(BackendError::Lost(_))), "{ended:?}");
         }
@@ -284,12 +282,7 @@ mod tests {
 
     #[test]
     fn a_request_that_is_over_before_its_submission_is_withdrawn() {
-        let (began, begins) = mpsc::channel();
-        let (end, may_end) = mpsc::channel();
-        let how = Counted {
-            began,
-            may_end: Mutex::new(may_end),
-        };
+        let (how, begins, end) = counted();
         let shared = Shared::default();
         let watchdog = Watchdog::default();
         thread::scope(|scope| {

@@ -163,9 +163,6 @@ pub struct PackedScene {
     pub(crate) words: Vec<u32>,
     /// Points; records hold offsets into them.
     pub(crate) points: Vec<[f32; 4]>,
-    /// Number of target points of all views, and of the view with the most.
-    pub(crate) targets: usize,
-    pub(crate) most_targets: usize,
     pub(crate) scene: SceneRecord,
     pub(crate) views: Vec<ViewRecord>,
     /// The clusters, large ones first.
@@ -212,12 +209,11 @@ impl PackedScene {
         for (scene, _) in &views {
             words.extend(bits(scene.statics()));
         }
-        let (mut targets, mut most_targets) = (0, 0);
+        let mut targets = 0;
         let view_records = views.iter().map(|&(scene, (at, weight))| {
             let [free, taken] = scene.indices();
             let normals = targets as u32;
             targets += scene.target.len();
-            most_targets = most_targets.max(scene.target.len());
             let unlabelled = std::iter::repeat(0);
             ViewRecord {
                 free: free.write_words(unlabelled, &mut words, &mut points),
@@ -249,8 +245,6 @@ impl PackedScene {
         Self {
             words,
             points,
-            targets,
-            most_targets,
             scene: record,
             views: view_records,
             clusters,

@@ -6,6 +6,7 @@ use nalgebra::{Matrix3, Vector3};
 
 use super::*;
 use crate::flow::data::{AlignedSweep, Point, RigidTransform, Uncontrolled, locked};
+use crate::flow::field::Backend;
 use crate::flow::gpu::tests::shared;
 use crate::flow::host::Host;
 use crate::flow::objects::SearchClouds;
@@ -59,11 +60,10 @@ fn parts_of_scenes_in_one_submission_have_the_bits_of_each_alone() {
     };
     let device = gpu.device();
     let scenes = [street(3), street(4)];
-    let alone = scenes.each_ref().map(|scene| {
-        let searches = &device.cluster_searches;
-        let found = searches.search(&device.context, device.kind, scene, &|| false);
-        found.expect("no error")
-    });
+    let found = |scene| gpu.search_clusters(scene, &|| false);
+    let alone = scenes
+        .each_ref()
+        .map(|scene| found(scene).expect("no error"));
     let [first, second] = alone.each_ref().map(|found| found.clusters.len());
     assert!(first > 4 && second > 4, "{first} and {second} clusters");
     let mut records = alone.iter().flat_map(|found| &found.clusters);
@@ -114,12 +114,9 @@ fn nothing_is_found_in_sweeps_without_points() {
     let Some(gpu) = shared() else {
         return;
     };
-    let device = gpu.device();
     let points = (0..400_u16).map(|i| [f32::from(i % 20) * 0.1, f32::from(i / 20) * 0.1, 1.0]);
     let scene = packed(&points.collect::<Vec<_>>(), &[], Vec::new());
-    let searches = &device.cluster_searches;
-    let found = searches.search(&device.context, device.kind, &scene, &|| false);
-    let found = found.expect("no error");
+    let found = gpu.search_clusters(&scene, &|| false).expect("no error");
     assert_eq!((found.clusters.len(), found.clusters[0].is_found), (1, 0));
     assert!(found.normals.is_empty());
 }
@@ -129,14 +126,9 @@ fn a_search_that_is_over_before_it_begins_finds_the_normals_alone() {
     let Some(gpu) = shared() else {
         return;
     };
-    let device = gpu.device();
     let scene = street(3);
-    let found = |over: bool| {
-        let searches = &device.cluster_searches;
-        let found = searches.search(&device.context, device.kind, &scene, &|| over);
-        found.expect("no error")
-    };
-    let [nothing, all] = [true, false].map(found);
+    let found = |over: bool| gpu.search_clusters(&scene, &|| over);
+    let [nothing, all] = [true, false].map(|over| found(over).expect("no error"));
     assert!(nothing.clusters.is_empty());
     assert!(!nothing.normals.is_empty());
     assert_eq!(nothing.normals, all.normals);
@@ -181,10 +173,8 @@ fn normals_are_those_of_planes_that_are_fitted_in_double_precision() {
     let Some(gpu) = shared() else {
         return;
     };
-    let device = gpu.device();
     let scene = street(3);
-    let searches = &device.cluster_searches;
-    let found = searches.search(&device.context, device.kind, &scene, &|| false);
+    let found = gpu.search_clusters(&scene, &|| false);
     let normals = found.expect("no error").normals;
     assert_eq!(scene.views.len(), 2);
     assert!(scene.views.iter().all(|view| view.taken.count > 0));

@@ -1,5 +1,6 @@
 // The records of the object search. PackedScene of flow/objects has the same; a test compares their
-// offsets. Offsets of points are into `points`, those of normals into `normals`; all others are into `words`.
+// offsets. Offsets of points are into `points`, those of normals into `normals`; all others are into
+// `words`.
 
 // A column index: the hash table of its tiles, its columns and its points in the order of slots.
 struct Index {
