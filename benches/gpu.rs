@@ -20,7 +20,7 @@ use fnsf::flow::gpu::{
     Adapter, Gpu, GpuOptions, KernelTime, Selector, arithmetic_peak, kernel_times, select,
 };
 use fnsf::flow::simulate::{SimulatedPair, Street, StreetOptions};
-use fnsf::flow::{Control, Estimate, Options, Precision, Preset, Problem, Solution, estimate};
+use fnsf::flow::{Control, Estimate, Options, Precision, Preset, Problem, estimate};
 
 /// Timed runs of each pair, after one warm-up run.
 const RUNS: u64 = 5;
@@ -335,18 +335,14 @@ fn objects(adapter: &Adapter) -> Result<(), String> {
 
 /// Seconds of the clouds, with the normals, and of the search of all clusters.
 fn search_seconds(estimate: &Estimate) -> f64 {
-    match &estimate.solution {
-        Solution::Objects(objects) => objects.seconds.preparation + objects.seconds.clusters,
-        Solution::Field(_) => f64::NAN,
-    }
+    let seconds = estimate.object_search().expect("an object search").seconds;
+    seconds.preparation + seconds.clusters
 }
 
 /// Number of clusters that were searched.
 fn clusters(estimate: &Estimate) -> usize {
-    match &estimate.solution {
-        Solution::Objects(objects) => objects.searched,
-        Solution::Field(_) => 0,
-    }
+    let search = estimate.object_search().expect("an object search");
+    search.searched
 }
 
 /// Seconds of the distance queries of a field; zero of an object search.

@@ -12,7 +12,7 @@ use std::time::Instant;
 use common::{Scene, median, scenes, street};
 use fnsf::flow::cpu::{CpuBackend, Isa, multiply_add_peak};
 use fnsf::flow::field::Backend;
-use fnsf::flow::{Control, Estimate, Options, Preset, Problem, Solution, estimate};
+use fnsf::flow::{Control, Estimate, Options, Preset, Problem, estimate};
 
 const SEEDS: u64 = 3;
 
@@ -138,10 +138,7 @@ fn objects_by_phase(pairs: &[Scene]) -> Result<(), String> {
 
 /// Milliseconds of the phases of an object search, and of all of them.
 fn phases(estimate: &Estimate) -> [f64; 7] {
-    let Solution::Objects(solution) = &estimate.solution else {
-        return [f64::NAN; 7];
-    };
-    let search = solution.seconds;
+    let search = estimate.object_search().expect("an object search").seconds;
     let found = search.preparation + search.clusters + search.assignment;
     [
         estimate.selection_seconds,

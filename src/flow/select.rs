@@ -69,7 +69,7 @@ pub(crate) fn select<'a>(
         [rows, target_rows] = rows_of_pair(problem, given, &masks, options)?;
     }
     let has_ground = masks.iter().any(Option::is_none);
-    let ego_only_rows = match &masks {
+    let ego_only_rows = || match &masks {
         [Some(ground), _] if options.ground == Ground::Auto && options.max_points.is_none() => {
             let is_in_crop = rows_in_crop([problem.source, given[0]], options);
             let rows = (0..ground.len()).filter(|&row| ground[row] && is_in_crop(row));
@@ -115,9 +115,9 @@ pub(crate) fn select<'a>(
         let registered = (options.ego == Ego::Auto).then(|| cropped(points, options));
         (points_at(rows, points), registered)
     };
-    let ((source, registered), (target, registered_target)) = rayon::join(
+    let ((source, registered), ((target, registered_target), ego_only_rows)) = rayon::join(
         || chosen(&rows, problem.source),
-        || chosen(&target_rows, problem.target),
+        || rayon::join(|| chosen(&target_rows, problem.target), ego_only_rows),
     );
     Ok(Selection {
         source,

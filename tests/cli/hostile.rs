@@ -6,6 +6,7 @@ use std::fs;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
+use super::process_memory::memory_bytes;
 use super::program::fnsf;
 
 /// Maximum memory for a file that is refused, bytes.
@@ -108,7 +109,7 @@ fn peak_memory(folder: &Path, arguments: &[&str]) -> Option<u64> {
         .stderr(Stdio::null())
         .spawn()
         .expect("the program starts");
-    let [running, status] = ["exe", "status"].map(|file| format!("/proc/{}/{file}", child.id()));
+    let running = format!("/proc/{}/exe", child.id());
     let mut peak = None;
     while child.try_wait().expect("the child is ours").is_none() {
         std::thread::yield_now();
@@ -116,10 +117,7 @@ fn peak_memory(folder: &Path, arguments: &[&str]) -> Option<u64> {
         if fs::read_link(&running).ok().as_ref() != Some(&program) {
             continue;
         }
-        let text = fs::read_to_string(&status).unwrap_or_default();
-        let line = text.lines().find_map(|line| line.strip_prefix("VmHWM:"));
-        let kilobytes = line.and_then(|l| l.trim().strip_suffix("kB")?.trim().parse::<u64>().ok());
-        peak = peak.max(kilobytes.map(|k| k * 1024));
+        peak = peak.max(memory_bytes(child.id(), "VmHWM:"));
     }
     peak
 }

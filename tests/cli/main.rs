@@ -23,6 +23,8 @@ mod label_repair;
 mod laz;
 #[path = "../common/object_server.rs"]
 mod object_server;
+#[path = "../common/process_memory.rs"]
+mod process_memory;
 mod program;
 #[path = "../common/real_data.rs"]
 mod real_data;

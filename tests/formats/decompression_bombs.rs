@@ -5,10 +5,11 @@ use std::io::Write;
 
 use fnsf::formats::{read_cloud, read_flow, read_pair};
 
+use crate::process_memory::memory_bytes;
 use crate::samples::npy;
 
-/// Maximum resident memory of the process that reads the files, KiB.
-const MAX_RESIDENT_KIB: u64 = 100 << 10;
+/// Maximum resident memory of the process that reads the files, bytes.
+const MAX_RESIDENT: u64 = 100 << 20;
 
 /// Environment variable that is set in the process that reads the files.
 const CHILD: &str = "FNSF_BOMBS_CHILD";
@@ -34,17 +35,10 @@ fn hostile_files_are_refused_in_little_memory() {
             && read_flow(&bytes, None).is_err()
             && read_pair(&bytes).is_err();
         assert!(refused, "{name}");
-        if let Some(resident) = peak_resident_kib() {
-            assert!(resident < MAX_RESIDENT_KIB, "{name}: {resident} KiB");
+        if let Some(resident) = memory_bytes(std::process::id(), "VmHWM:") {
+            assert!(resident < MAX_RESIDENT, "{name}: {resident} bytes");
         }
     }
-}
-
-/// Peak resident memory of this process, KiB; none if the system does not report it.
-fn peak_resident_kib() -> Option<u64> {
-    let status = std::fs::read_to_string("/proc/self/status").ok()?;
-    let line = status.lines().find(|line| line.starts_with("VmHWM:"))?;
-    line.split_ascii_whitespace().nth(1)?.parse().ok()
 }
 
 fn bombs() -> Vec<(&'static str, Vec<u8>)> {

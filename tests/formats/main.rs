@@ -18,6 +18,9 @@ mod las;
 #[cfg(test)]
 mod poses;
 #[cfg(test)]
+#[path = "../common/process_memory.rs"]
+mod process_memory;
+#[cfg(test)]
 mod real_data;
 #[cfg(test)]
 mod recordings;

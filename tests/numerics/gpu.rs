@@ -3,7 +3,7 @@
 use fnsf::flow::cpu::{CpuBackend, Isa};
 use fnsf::flow::field::Backend;
 use fnsf::flow::gpu::{AdapterKind, Gpu, GpuOptions, adapters};
-use fnsf::flow::{Estimate, ObjectSolution, Preset, Problem, Solution, Uncontrolled, estimate};
+use fnsf::flow::{Preset, Problem, Uncontrolled, estimate};
 
 use super::gpu_rule;
 use super::scenes::{estimated_on, real_pair, scored};
@@ -38,14 +38,6 @@ fn a_card_gives_the_cpus_flow_on_argoverse_2_bit_by_bit() {
     assert!(first == second);
 }
 
-/// The solution of an estimate by an object search.
-fn found(estimate: &Estimate) -> Option<&ObjectSolution> {
-    match &estimate.solution {
-        Solution::Objects(solution) => Some(solution),
-        Solution::Field(_) => None,
-    }
-}
-
 #[test]
 fn a_card_finds_the_cpus_objects_in_whole_real_sweeps() {
     /// Least share of points whose flows have the same bits. Static points have those of the ego
@@ -76,7 +68,8 @@ fn a_card_finds_the_cpus_objects_in_whole_real_sweeps() {
         let [card, host] = [&gpu as &dyn Backend, &cpu]
             .map(|backend| estimate(backend, &problem, &options, &Uncontrolled).expect("a flow"));
         assert_eq!(card.device, gpu.name());
-        let [on_card, on_host] = [&card, &host].map(|estimate| found(estimate).expect("objects"));
+        let [on_card, on_host] =
+            [&card, &host].map(|found| found.object_search().expect("objects"));
         assert!(on_card.searched > 100, "{name}");
         assert_eq!(on_card.searched, on_host.searched, "{name}");
         assert_eq!(on_card.objects.cluster, on_host.objects.cluster, "{name}");

@@ -2,9 +2,7 @@
 //! measured figures.
 
 use fnsf::flow::simulate::StreetOptions;
-use fnsf::flow::{
-    Estimate, Ground, ObjectSolution, Preset, Problem, Solution, StopReason, Uncontrolled, estimate,
-};
+use fnsf::flow::{Ground, Preset, Problem, StopReason, Uncontrolled, estimate};
 
 use super::scenes::{estimated, real_pair, score, street};
 
@@ -65,7 +63,7 @@ fn the_vehicle_itself_has_no_flow_and_no_cluster() {
     let backend = fnsf::flow::cpu::CpuBackend::new(None).expect("threads");
     let options = Preset::Default.options(None);
     let estimate = estimate(&backend, &problem, &options, &Uncontrolled).expect("a flow");
-    let found = search(&estimate);
+    let found = estimate.object_search().expect("objects");
     assert!(found.own_points >= 700, "{}", found.own_points);
     let left = |row: usize| !estimate.valid[row] && estimate.flow[row] == [0.0; 3];
     let own = (first..pair.source.len()).filter(|&row| left(row)).count();
@@ -103,13 +101,6 @@ fn the_hood_of_a_real_vehicle_is_no_moving_object() {
     assert!(near.iter().filter(|&&row| dynamic[row]).count() * 50 < near.len());
 }
 
-fn search(estimate: &Estimate) -> &ObjectSolution {
-    let Solution::Objects(solution) = &estimate.solution else {
-        unreachable!("no field was asked for")
-    };
-    solution
-}
-
 #[test]
 fn what_is_dynamic_is_what_an_object_moves() {
     let pair = street(&StreetOptions {
@@ -119,7 +110,7 @@ fn what_is_dynamic_is_what_an_object_moves() {
     });
     let estimate = estimated(&pair, &Preset::Default.options(None));
     assert_eq!(estimate.stop_reason, StopReason::Completed);
-    let search = search(&estimate);
+    let search = estimate.object_search().expect("objects");
     assert_eq!(search.searched, search.candidates);
     let dynamic = estimate.dynamic.expect("the ego motion is estimated");
     let found = dynamic.iter().filter(|&&moves| moves).count();
@@ -159,9 +150,11 @@ fn points_that_are_drawn_have_the_flow_that_they_have_among_all_and_the_others_n
             options.seed = seed;
             let drawn = estimated(&pair, &options);
             assert_eq!((drawn.points, drawn.ego), (DRAWN, all.ego));
-            let [drawn_search, all_search] = [&drawn, &all].map(search);
-            assert_eq!(drawn_search.searched, all_search.searched);
-            assert_eq!(drawn_search.cost_m.to_bits(), all_search.cost_m.to_bits());
+            let [of_drawn, of_all] = [&drawn, &all].map(|found| {
+                let search = found.object_search().expect("objects");
+                (search.searched, search.cost_m.to_bits())
+            });
+            assert_eq!(of_drawn, of_all);
             let valid = drawn.valid.iter().filter(|&&valid| valid).count();
             assert_eq!(valid, DRAWN, "{preset:?}");
             let [moves, may_move] = [&drawn, &all].map(|e| e.dynamic.as_ref().expect("an ego"));

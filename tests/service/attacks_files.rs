@@ -409,16 +409,10 @@ async fn a_file_with_more_points_than_the_server_takes_is_refused_before_it_is_u
             .is_some_and(|text| text.contains("2000000 are taken")),
         "{said}"
     );
-    let peak = std::fs::read_to_string(format!("/proc/{}/status", siege.server.id()));
-    let peak = peak.expect("it runs on Linux");
-    let line = peak.lines().find_map(|line| line.strip_prefix("VmHWM:"));
-    let kibibytes = line.and_then(|line| line.trim().strip_suffix("kB")?.trim().parse().ok());
-    let before = siege.server.resident_bytes() >> 10;
+    let peak = siege.server.peak_resident_bytes();
+    let now = siege.server.resident_bytes();
     // The memory of the compressed file a few times over, but not of its decoded points.
-    assert!(
-        kibibytes.is_some_and(|peak: u64| peak < before + (40 << 10)),
-        "{kibibytes:?} KiB at most, {before} now"
-    );
+    assert!(peak < now + (40 << 20), "{peak} bytes at most, {now} now");
     siege.stands().await;
 }
 
@@ -445,14 +439,8 @@ async fn small_files_that_unfold_to_large_clouds_share_the_room_of_uploads() {
         // Accepted, refused for its content or for lack of space; never an internal error.
         assert!(status != 500, "{status}");
     }
-    let about = std::fs::read_to_string(format!("/proc/{}/status", siege.server.id()));
-    let about = about.expect("it runs on Linux");
-    let peak = about.lines().find_map(|line| line.strip_prefix("VmHWM:"));
-    let peak = peak.and_then(|line| line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok());
+    let peak = siege.server.peak_resident_bytes();
     // Two clouds of 26 MB at a time, the data that one of them is decoded from, and its encoded
     // bytes.
-    assert!(
-        peak.is_some_and(|kibibytes| kibibytes < 500 << 10),
-        "{peak:?} KiB"
-    );
+    assert!(peak < 500 << 20, "{peak} bytes");
 }

@@ -40,6 +40,8 @@ mod objects;
 mod poses;
 #[path = "../common/postgres_server.rs"]
 mod postgres_server;
+#[path = "../common/process_memory.rs"]
+mod process_memory;
 mod raw_http;
 mod readme;
 #[path = "../common/real_data.rs"]

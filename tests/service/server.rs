@@ -9,6 +9,8 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
+use crate::process_memory::memory_bytes;
+
 /// Timeout that suffices on a loaded machine. Only a failing test waits this long.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
 
@@ -212,11 +214,12 @@ impl Server {
 
     /// Resident memory of the server, bytes.
     pub(crate) fn resident_bytes(&self) -> u64 {
-        let status = std::fs::read_to_string(format!("/proc/{}/status", self.id()))
-            .expect("it runs on Linux");
-        let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
-        let kibibytes = line.and_then(|line| line.trim().strip_suffix("kB")?.trim().parse().ok());
-        kibibytes.map_or(0, |kibibytes: u64| kibibytes * 1024)
+        memory_bytes(self.id(), "VmRSS:").expect("it runs on Linux")
+    }
+
+    /// The largest resident memory of the server so far, bytes.
+    pub(crate) fn peak_resident_bytes(&self) -> u64 {
+        memory_bytes(self.id(), "VmHWM:").expect("it runs on Linux")
     }
 
     /// Sends a signal to the server.

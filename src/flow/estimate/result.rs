@@ -78,12 +78,17 @@ impl Estimate {
         deskewed.unwrap_or_else(|| given.map(Arc::clone))
     }
 
-    /// The objects; none for [`crate::flow::Method::Field`].
-    pub fn objects(&self) -> Option<&Objects> {
+    /// The outcome of the object search; none for [`crate::flow::Method::Field`].
+    pub fn object_search(&self) -> Option<&ObjectSolution> {
         match &self.solution {
-            Solution::Objects(solution) => Some(&solution.objects),
+            Solution::Objects(solution) => Some(solution),
             Solution::Field(_) => None,
         }
+    }
+
+    /// The objects; none for [`crate::flow::Method::Field`].
+    pub fn objects(&self) -> Option<&Objects> {
+        self.object_search().map(|search| &search.objects)
     }
 
     /// The outcome of the fit; none for [`crate::flow::Method::Objects`].

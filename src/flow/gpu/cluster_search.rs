@@ -203,16 +203,21 @@ impl Search<'_> {
         let of_normals = [&words, &scene, &views, &points, &normals];
         let of_search = [&records, &scratch, &results];
         let of_search: Vec<_> = of_normals.into_iter().chain(of_search).collect();
-        let mut encoder = context.encoder();
-        {
-            let untimed = wgpu::ComputePassDescriptor::default();
-            let mut pass = encoder.begin_compute_pass(&untimed);
-            let groups = targets.max().unwrap_or(0).div_ceil(NORMALS_GROUP);
-            pass.set_pipeline(&self.kernels.normals);
-            pass.set_bind_group(0, &context.bound(&self.kernels.normals, &of_normals), &[]);
-            pass.dispatch_workgroups(groups as u32, packed.views.len() as u32, 1);
+        let of_normals = context.bound(&self.kernels.normals, &of_normals);
+        // A submission for each view, as for other long searches: in a tall heap of points each is near
+        // to all others, and drivers give up on a submission that takes seconds.
+        for (view, targets) in (0_u32..).zip(targets) {
+            let mut encoder = context.encoder();
+            {
+                let untimed = wgpu::ComputePassDescriptor::default();
+                let mut pass = encoder.begin_compute_pass(&untimed);
+                pass.set_pipeline(&self.kernels.normals);
+                pass.set_bind_group(0, &of_normals, &[]);
+                pass.set_immediates(0, bytemuck::bytes_of(&view));
+                pass.dispatch_workgroups(targets.div_ceil(NORMALS_GROUP) as u32, 1, 1);
+            }
+            context.queue.submit([encoder.finish()]);
         }
-        context.queue.submit([encoder.finish()]);
         Ok(UploadedScene {
             group: context.bound(&self.kernels.search, &of_search),
             results,

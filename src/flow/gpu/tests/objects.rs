@@ -7,7 +7,7 @@ use super::shared;
 use super::whole::{end_point_error, solved};
 use crate::flow::cpu::CpuBackend;
 use crate::flow::data::{Control, Interrupt, Point, Uncontrolled};
-use crate::flow::estimate::{Estimate, Solution, estimate};
+use crate::flow::estimate::{Estimate, estimate};
 use crate::flow::field::Backend;
 use crate::flow::options::{Ego, Ground, Options, Preset};
 use crate::flow::problem::{NeighborSweep, Problem};
@@ -38,18 +38,14 @@ fn agreement(a: &[Point], b: &[Point]) -> f64 {
 
 /// For each point the probability that its flow is right.
 fn confidence(estimate: &Estimate) -> &[f32] {
-    match &estimate.solution {
-        Solution::Objects(objects) => &objects.objects.confidence,
-        Solution::Field(_) => &[],
-    }
+    let objects = estimate.objects().expect("an object search");
+    &objects.confidence
 }
 
 /// Number of clusters that were searched.
 fn searched(estimate: &Estimate) -> usize {
-    match &estimate.solution {
-        Solution::Objects(objects) => objects.searched,
-        Solution::Field(_) => 0,
-    }
+    let search = estimate.object_search().expect("an object search");
+    search.searched
 }
 
 #[test]
