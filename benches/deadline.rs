@@ -69,7 +69,7 @@ fn run(
         before: None,
         neighbors: &[],
     };
-    backend.host().forget();
+    backend.host().clear_cache();
     let clock = Clock(Instant::now(), deadline);
     let estimate = estimate(backend, &problem, options, &clock).map_err(|e| e.to_string())?;
     let milliseconds = clock.seconds() * 1e3;

@@ -96,7 +96,7 @@ fn estimated(
     options: &Options,
 ) -> Result<Estimate, String> {
     let problem = Problem::pair(&pair.source, &pair.target);
-    backend.host().forget();
+    backend.host().clear_cache();
     let clock = Clock(Instant::now());
     estimate(backend, &problem, options, &clock).map_err(|e| e.to_string())
 }
@@ -304,7 +304,7 @@ fn objects(adapter: &Adapter) -> Result<(), String> {
         let mut runs = [const { Vec::new() }; 2];
         for run in 0..=RUNS {
             for (backend, runs) in backends.iter().zip(&mut runs) {
-                backend.host().forget();
+                backend.host().clear_cache();
                 let clock = Clock(Instant::now());
                 let found = estimate(*backend, &problem, &options, &clock);
                 let found = found.map_err(|e| e.to_string())?;

@@ -117,7 +117,7 @@ fn objects_by_phase(pairs: &[Scene]) -> Result<(), String> {
         for (scene, runs) in scenes.iter().zip(&mut runs) {
             let problem = Problem::pair(&scene.source, &scene.target);
             for (backend, runs) in backends.iter().zip(runs) {
-                backend.host().forget();
+                backend.host().clear_cache();
                 let clock = Clock(Instant::now());
                 let estimate = estimate(backend, &problem, &options, &clock);
                 runs.push(phases(&estimate.map_err(|e| e.to_string())?));
@@ -169,7 +169,7 @@ fn presets_by_size(scenes: &[Scene]) -> Result<(), String> {
                         seed,
                         ..preset.options(max_points)
                     };
-                    backend.host().forget();
+                    backend.host().clear_cache();
                     let clock = Clock(Instant::now());
                     let run = estimate(&backend, &problem, &options, &clock);
                     runs.push(run.map_err(|e| e.to_string())?);

@@ -101,7 +101,7 @@ fn rate(scene: &Scene, options: &Options, lanes: usize, threads: usize) -> Resul
     let backends = backends.map_err(|e| e.to_string())?;
     let solve = |backend: &CpuBackend| -> Result<(), String> {
         let problem = Problem::pair(&scene.source, &scene.target);
-        backend.host().forget();
+        backend.host().clear_cache();
         let clock = Clock(Instant::now());
         let solved = estimate(backend, &problem, options, &clock);
         solved.map(|_| ()).map_err(|e| e.to_string())

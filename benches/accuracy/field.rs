@@ -214,7 +214,7 @@ fn fitted(backend: &CpuBackend, pair: &Pair, options: &Options) -> Result<Run, S
         neighbors: &[],
     };
     let clock = Clock::start();
-    backend.host().forget();
+    backend.host().clear_cache();
     let estimate = flow::estimate(backend, &problem, options, &clock).map_err(|e| e.to_string())?;
     let known = pair.truth.as_ref().ok_or("the pair has no truth")?;
     let truth = Truth {

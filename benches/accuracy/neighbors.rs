@@ -142,7 +142,7 @@ fn searched(
         neighbors: &neighbors,
     };
     let clock = Clock::start();
-    backend.host().forget();
+    backend.host().clear_cache();
     let found = flow::estimate(backend, &problem, &options, &clock).map_err(|e| e.to_string())?;
     let truth = Truth {
         dynamic: Some(&known.dynamic),

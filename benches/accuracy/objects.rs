@@ -119,7 +119,7 @@ fn searched(backend: &CpuBackend, pair: &LabelledPair, options: &Options) -> Res
         neighbors: &[],
     };
     let clock = Clock::start();
-    backend.host().forget();
+    backend.host().clear_cache();
     let estimate = flow::estimate(backend, &problem, options, &clock).map_err(|e| e.to_string())?;
     let dynamic = pair.dynamic.as_deref();
     let truth = Truth {

@@ -240,7 +240,7 @@ fn row(name: &str, backend: &CpuBackend, cases: &[Case]) {
     let mut degrees = Vec::new();
     let mut times = Vec::new();
     for case in cases {
-        backend.host().forget();
+        backend.host().clear_cache();
         let start = Instant::now();
         let prior = RigidTransform::identity();
         let found = backend

@@ -107,7 +107,7 @@ fn alone(backend: &CpuBackend, drive: &Drive, options: &Options) -> anyhow::Resu
     let mut sums = Sums::default();
     for (k, pair) in drive.sweeps.windows(2).enumerate() {
         let problem = Problem::pair(&pair[0], &pair[1]);
-        backend.host().forget();
+        backend.host().clear_cache();
         let began = Instant::now();
         let estimate = estimate(backend, &problem, options, &Uncontrolled)?;
         let seconds = began.elapsed().as_secs_f64();
@@ -122,7 +122,7 @@ fn alone(backend: &CpuBackend, drive: &Drive, options: &Options) -> anyhow::Resu
 fn in_sequence(backend: &CpuBackend, drive: &Drive, options: &Options) -> anyhow::Result<Sums> {
     let mut sums = Sums::default();
     let mut sequence = Sequence::default();
-    backend.host().forget();
+    backend.host().clear_cache();
     for (k, points) in drive.sweeps.iter().enumerate() {
         let sweep = Sweep {
             points: points.clone(),

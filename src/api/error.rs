@@ -93,7 +93,7 @@ pub enum ApiError {
     JobFailed(JobId, JobError),
     /// The deadline passed while the job was queued. Reported to a caller that waits for the
     /// result.
-    #[error("the deadline passed before a device was free")]
+    #[error("the deadline passed before the work began")]
     Expired(JobId),
     /// The job expired earlier: its deadline passed while it was queued. Reported when its result
     /// is fetched. Only a requeue runs it again.

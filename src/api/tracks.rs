@@ -104,9 +104,10 @@ impl Service {
             let flow = StoredFlow::from_bytes(&flow).map_err(|error| damaged(id, error))?;
             let cloud = StoredCloud::from_bytes(&cloud).map_err(|error| damaged(id, error))?;
             let (Some(objects), Some(ego)) = (&flow.objects, &flow.ego) else {
-                let text =
-                    "tracks need clusters and the ego motion: use the preset default or label";
-                return Err(ApiError::BadRequest(text.to_owned()));
+                return Err(ApiError::BadRequest(format!(
+                    "tracks need clusters and the ego motion, which pair {id} has not: use the preset \
+                     default or label, and no deadline"
+                )));
             };
             let sweep = ClusteredSweep {
                 points: &cloud.points,

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use anyhow::{Context, anyhow};
+use anyhow::Context;
 use clap::Args;
 use reqwest::multipart::Form;
 use reqwest::{Method, RequestBuilder, Response, StatusCode};
@@ -18,14 +18,23 @@ pub(super) struct ServerFlags {
     /// Address of the server
     #[arg(
         long,
+        global = true,
         value_name = "URL",
         env = "FNSF_SERVER",
-        default_value = "http://127.0.0.1:8080"
+        default_value = "http://127.0.0.1:8080",
+        value_parser = address
     )]
     server: Url,
     /// File with the API key; otherwise it is taken from FNSF_API_KEY
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, global = true, value_name = "FILE")]
     key_file: Option<PathBuf>,
+}
+
+/// Parses the address of a server.
+fn address(text: &str) -> Result<Url, String> {
+    let address = Url::parse(text).ok();
+    let address = address.filter(|url| matches!(url.scheme(), "http" | "https"));
+    address.ok_or_else(|| "an address such as http://127.0.0.1:8080 is needed".to_owned())
 }
 
 impl ServerFlags {
@@ -60,7 +69,25 @@ pub(super) fn block_on<T>(command: impl Future<Output = Result<T, Failure>>) -> 
 #[error("the server answered {status}: {detail}")]
 struct Refused {
     status: StatusCode,
+    code: String,
     detail: String,
+}
+
+/// The failure of a command by an error of the client: wrong options are an error of usage, and sweeps
+/// that the server refuses are bad input.
+pub(super) fn failure(error: anyhow::Error) -> Failure {
+    let refused = error.downcast_ref::<Refused>();
+    let refused = refused.map(|refused| (refused.status, refused.code.as_str()));
+    match refused {
+        Some((_, "bad_request" | "invalid_options")) => Failure::usage(error),
+        Some((
+            StatusCode::PAYLOAD_TOO_LARGE
+            | StatusCode::UNSUPPORTED_MEDIA_TYPE
+            | StatusCode::UNPROCESSABLE_ENTITY,
+            _,
+        )) => Failure::bad_input(error),
+        _ => Failure::internal(error),
+    }
 }
 
 /// Whether a request may succeed when it is repeated: the server was not reached, or it starts or stops.
@@ -80,11 +107,6 @@ pub(super) struct Client {
 
 impl Client {
     pub(super) fn new(server: Url, key: Option<String>) -> anyhow::Result<Self> {
-        if !matches!(server.scheme(), "http" | "https") {
-            return Err(anyhow!(
-                "{server} is no address such as http://127.0.0.1:8080"
-            ));
-        }
         let _named_already = rustls::crypto::ring::default_provider().install_default();
         let http = reqwest::Client::builder()
             .user_agent(concat!("fnsf/", env!("CARGO_PKG_VERSION")))
@@ -110,9 +132,13 @@ impl Client {
         }
         let status = response.status();
         let problem: Value = response.json().await.unwrap_or_default();
-        let detail = problem["detail"].as_str().unwrap_or("without a word");
-        let detail = detail.to_owned();
-        Err(Refused { status, detail }.into())
+        let text = |key: &str| problem[key].as_str().map(ToOwned::to_owned);
+        Err(Refused {
+            status,
+            code: text("code").unwrap_or_default(),
+            detail: text("detail").unwrap_or_else(|| "without a word".to_owned()),
+        }
+        .into())
     }
 
     /// Sends a request without a body, and reads the JSON of its answer; null of an empty one.

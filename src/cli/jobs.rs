@@ -5,7 +5,7 @@ use reqwest::Method;
 use serde_json::Value;
 use url::form_urlencoded::Serializer;
 
-use super::client::{Client, ServerFlags, block_on};
+use super::client::{self, Client, ServerFlags, block_on};
 use super::failure::Failure;
 use super::output::{say, show};
 
@@ -92,7 +92,7 @@ impl Jobs {
             } => list(client, filter, *limit, *json).await,
             Command::Show { id } => {
                 let job = client.call(Method::GET, &path(id, "")).await;
-                let job = job.map_err(Failure::internal)?;
+                let job = job.map_err(client::failure)?;
                 show(format_args!("{job:#}"))
             }
             Command::Cancel(of) => each(client, of, &CANCEL).await,
@@ -162,7 +162,7 @@ async fn find(client: &Client, filter: &Filter, limit: usize) -> Result<Vec<Valu
         }
         let path = format!("/v1/jobs?{}", query.finish());
         let page = client.call(Method::GET, &path).await;
-        let mut page = page.map_err(Failure::internal)?;
+        let mut page = page.map_err(client::failure)?;
         let Value::Array(jobs) = page["jobs"].take() else {
             return Err(Failure::internal(anyhow::anyhow!(
                 "the answer is no page of jobs"

@@ -10,7 +10,7 @@ use reqwest::Method;
 use reqwest::multipart::{Form, Part};
 use serde_json::{Value, json};
 
-use super::client::{Client, ServerFlags, block_on, may_pass};
+use super::client::{self, Client, ServerFlags, block_on, may_pass};
 use super::failure::Failure;
 use super::files::{self, Output};
 use super::output::say;
@@ -154,7 +154,7 @@ impl Submit {
         };
         let job = client.send(request.multipart(form)).await;
         let job: Value = job
-            .map_err(Failure::internal)?
+            .map_err(client::failure)?
             .json()
             .await
             .map_err(Failure::internal)?;
@@ -163,6 +163,7 @@ impl Submit {
             return say(format_args!("{id}"));
         };
         let terminal = Terminal::new();
+        terminal.part(&format!("job {id}"));
         let ended = until_ended(client, &job, &terminal).await;
         terminal.finish();
         let ended = ended.map_err(Failure::internal)?;
@@ -171,9 +172,11 @@ impl Submit {
                 .as_str()
                 .unwrap_or("without a word");
             let state = ended["state"].as_str().unwrap_or_default();
-            return Err(Failure::internal(anyhow!(
-                "job {id} ended as {state}: {why}"
-            )));
+            let error = anyhow!("job {id} ended as {state}: {why}");
+            return Err(match ended["error"]["code"].as_str() {
+                Some("input_refused" | "no_overlap") => Failure::bad_input(error),
+                _ => Failure::internal(error),
+            });
         }
         let fetched = fetch(client, &job, &media_type, output)
             .await

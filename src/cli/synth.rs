@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use anyhow::Context;
+use anyhow::{Context, anyhow};
 use clap::Args;
 
 use super::failure::Failure;
@@ -87,6 +87,13 @@ impl Synth {
             ..StreetOptions::default()
         })
         .map_err(Failure::usage)?;
+        let next = self.output.join(format!("sweep_{:04}.pcd", self.sweeps));
+        if next.exists() {
+            return Err(Failure::usage(anyhow!(
+                "{} is of a longer street: remove the files of that street, or choose another folder",
+                next.display()
+            )));
+        }
         std::fs::create_dir_all(&self.output)
             .with_context(|| format!("cannot make {}", self.output.display()))
             .map_err(Failure::internal)?;

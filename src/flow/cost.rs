@@ -156,8 +156,8 @@ fn predicted(problem: &Problem, options: &Options) -> Result<Cost, FlowError> {
         0 => problem.source.len() + problem.target.len(),
         _ => 0,
     };
-    let undrawn = selection.undrawn.iter().flatten();
-    let undrawn: usize = undrawn.map(Vec::len).sum();
+    let unsampled = selection.unsampled.iter().flatten();
+    let unsampled: usize = unsampled.map(Vec::len).sum();
     let neighbors = problem.nearest_neighbors(options.sweeps());
     let neighbors = neighbors
         .iter()
@@ -174,7 +174,7 @@ fn predicted(problem: &Problem, options: &Options) -> Result<Cost, FlowError> {
             + (POINT_COPIES * source_points + target_points) * size_of::<Point>()
             + registered * THINNING_BYTES
             + unregistered * OVERLAP_BYTES
-            + undrawn * DRAWN_FROM_BYTES
+            + unsampled * DRAWN_FROM_BYTES
             + neighbor_bytes
             + WORKING_SETS,
         multiply_adds: method.multiply_adds

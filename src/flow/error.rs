@@ -8,8 +8,9 @@ use super::options::LEAST_OVERLAP;
 /// The reason why an estimate was rejected or failed.
 #[derive(Debug, thiserror::Error)]
 pub enum FlowError {
-    /// Fewer than [`MIN_POINTS`] points of a cloud are selected: finite, within the crop and not
-    /// masked. For a field, [`super::Options::max_points`] below this number causes it as well.
+    /// Fewer than [`MIN_POINTS`] points of a cloud are selected: finite, within the crop, not too near
+    /// the sensor, and not masked. For a field, [`super::Options::max_points`] below this number causes
+    /// it as well.
     #[error("the {cloud} cloud has {points} usable points, at least {MIN_POINTS} are needed")]
     TooFewPoints {
         /// `source` or `target`.
@@ -46,7 +47,7 @@ pub enum FlowError {
     #[error(
         "the sweeps do not show one scene: {:.0}% of what one shows is in the other after the best alignment, \
          {:.0}% are needed: are they consecutive sweeps of one sensor, and is a given ego motion \
-         target_from_source? The option force estimates them all the same",
+         target_from_source? The option force (--force) estimates them all the same",
         100.0 * overlap,
         100.0 * LEAST_OVERLAP
     )]
@@ -57,7 +58,7 @@ pub enum FlowError {
     /// The points of a sweep lie too far apart for metres, see [`super::MAX_SPREAD_M`].
     #[error(
         "half of the {cloud} cloud's points lie more than {spread_m:.0} m from their middle: coordinates are \
-         metres, are these millimetres? The option force estimates them all the same"
+         metres, are these millimetres? The option force (--force) estimates them all the same"
     )]
     NotMetres {
         /// `source` or `target`.

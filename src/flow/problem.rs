@@ -19,8 +19,9 @@ pub struct Problem<'a> {
     /// masks are absent.
     pub ground: Option<[&'a [bool]; 2]>,
     /// N and M times of the points, seconds after the time of their sweep; it may be negative. With
-    /// them and an ego motion the sweeps are deskewed where they fit better then. None
-    /// where they are unknown: each sweep then counts as measured at one instant.
+    /// them and an ego motion the sweeps are deskewed where they fit better then. A point whose time is
+    /// not finite is then left out like one that is not finite. None where they are unknown: each sweep
+    /// then counts as measured at one instant.
     pub times: Option<[&'a [f32]; 2]>,
     /// The motion field of the previous pair, whose target is this pair's source. None for an
     /// independent pair.

@@ -21,18 +21,20 @@ pub(crate) struct Selection<'a> {
     pub(crate) target: Vec<Point>,
     /// Indices into `rows` of the points that get a flow. All of them, except where an object
     /// search samples its output.
-    pub(crate) output_rows: Vec<usize>,
+    pub(crate) output_indices: Vec<usize>,
     /// Source rows of ground points that are excluded from the method and get the ego-motion flow.
     pub(crate) ego_only_rows: Vec<usize>,
     /// Source and target clouds for the registration, where the ego motion is estimated: all points
-    /// that are finite and within the crop. Ground is included, because it determines pitch, roll
-    /// and height.
+    /// that are finite, within the crop and not too near. Ground is included, because it determines
+    /// pitch, roll and height.
     pub(crate) registration_clouds: Option<[Cow<'a, [Point]>; 2]>,
     /// All points of the two clouds that `source` and `target` were sampled from; none where they
     /// were not sampled.
-    pub(crate) undrawn: Option<[Vec<Point>; 2]>,
+    pub(crate) unsampled: Option<[Vec<Point>; 2]>,
     /// Whether the ground is among the selected points.
     pub(crate) has_ground: bool,
+    /// Whether the source lies far from the origin of its frame, where the sensor should be.
+    pub(crate) is_off_origin: bool,
 }
 
 /// Ground segmentation of several sweeps: one mask per sweep. All points are finite and within the
@@ -77,8 +79,8 @@ pub(crate) fn select<'a>(
         }
         _ => Vec::new(),
     };
-    let mut output_rows: Vec<usize> = (0..rows.len()).collect();
-    let mut undrawn = None;
+    let mut output_indices: Vec<usize> = (0..rows.len()).collect();
+    let mut unsampled = None;
     if let Some(max_points) = options.max_points {
         // One permutation for both clouds, as in the published code. Each cloud draws from all of
         // its rows, because rows are in scan order.
@@ -90,16 +92,16 @@ pub(crate) fn select<'a>(
         };
         match options.method {
             // A sparse sample has no clusters, so the object search uses all points.
-            Method::Objects(_) => output_rows = drawn(rows.len()),
+            Method::Objects(_) => output_indices = drawn(rows.len()),
             Method::Field(_) => {
-                undrawn = Some([
+                unsampled = Some([
                     points_at(&rows, problem.source),
                     points_at(&target_rows, problem.target),
                 ]);
                 for rows in [&mut rows, &mut target_rows] {
                     *rows = drawn(rows.len()).iter().map(|&index| rows[index]).collect();
                 }
-                output_rows.truncate(rows.len());
+                output_indices.truncate(rows.len());
             }
         }
     }
@@ -123,11 +125,12 @@ pub(crate) fn select<'a>(
         source,
         target,
         registration_clouds: registered.zip(registered_target).map(<[_; 2]>::from),
-        undrawn,
+        unsampled,
         has_ground,
+        is_off_origin: is_off_origin(problem.source),
         rows,
         target_rows,
-        output_rows,
+        output_indices,
         ego_only_rows,
     })
 }
@@ -141,11 +144,30 @@ fn points_at(rows: &[usize], points: &[Point]) -> Vec<Point> {
 /// # Errors
 /// [`FlowError::NotMetres`].
 fn check_metres(cloud: &'static str, points: &[Point], options: &Options) -> Result<(), FlowError> {
-    /// Points that are looked at.
-    const SAMPLED: usize = 1024;
     if options.force {
         return Ok(());
     }
+    let (_, spread_m) = middle(points);
+    if spread_m > MAX_SPREAD_M {
+        return Err(FlowError::NotMetres { cloud, spread_m });
+    }
+    Ok(())
+}
+
+/// Whether a cloud lies so far from the origin of its frame that this is not the sensor's: its middle is
+/// farther away than three times its spread and 50 m more.
+fn is_off_origin(points: &[Point]) -> bool {
+    const SPREADS: f32 = 3.0;
+    const AWAY_M: f32 = 50.0;
+    let ([x, y, _], spread_m) = middle(points);
+    x.hypot(y) > SPREADS * spread_m + AWAY_M
+}
+
+/// The middle of a cloud, the median of each coordinate, and the median distance of its points from it,
+/// metres. Points that are not finite are ignored.
+fn middle(points: &[Point]) -> (Point, f32) {
+    /// Points that are looked at.
+    const SAMPLED: usize = 1024;
     let sampled = stride_sample(points, SAMPLED);
     let finite = |point: &&Point| point.iter().all(|c| c.is_finite());
     let axis = |a: usize| {
@@ -161,10 +183,7 @@ fn check_metres(cloud: &'static str, points: &[Point], options: &Options) -> Res
     let from_middle = sampled.iter().filter(finite);
     let from_middle = from_middle.map(|&point| square_distance(point, middle).sqrt());
     let spread_m = median(from_middle.collect());
-    if spread_m > MAX_SPREAD_M {
-        return Err(FlowError::NotMetres { cloud, spread_m });
-    }
-    Ok(())
+    (middle, spread_m)
 }
 
 /// The median; zero of no values.
@@ -234,7 +253,7 @@ pub(crate) fn ground_masks<'a, const SWEEPS: usize>(
     }))
 }
 
-/// All points that are finite and within the crop.
+/// All points that are finite, within the crop and not too near.
 pub(crate) fn cropped<'a>(points: &'a [Point], options: &Options) -> Cow<'a, [Point]> {
     let is_kept = |point: &Point| is_in_crop(*point, options);
     if points.iter().all(is_kept) {
@@ -422,12 +441,12 @@ mod tests {
         let fitted = selected(&problem, &fitted);
         let objects = selected(&problem, &objects);
         assert_eq!((objects.rows.len(), objects.target.len()), (100, 100));
-        let output_rows = |selection: &Selection| -> Vec<usize> {
-            let places = selection.output_rows.iter();
+        let output_indices = |selection: &Selection| -> Vec<usize> {
+            let places = selection.output_indices.iter();
             places.map(|&place| selection.rows[place]).collect()
         };
-        assert_eq!(output_rows(&objects), output_rows(&fitted));
-        assert_eq!(output_rows(&fitted), fitted.rows);
+        assert_eq!(output_indices(&objects), output_indices(&fitted));
+        assert_eq!(output_indices(&fitted), fitted.rows);
     }
 
     #[test]

@@ -70,7 +70,8 @@ impl Sweep {
         }
     }
 
-    /// The rows of points that are finite and within the crop of `options`.
+    /// The rows of points that are finite, within the crop of `options`, and not nearer than its
+    /// `min_range_m`.
     pub fn rows_in_crop(&self, options: &Options) -> Vec<usize> {
         let rows = 0..self.points.len();
         rows.filter(|&row| is_in_crop(self.points[row], options))

@@ -46,12 +46,23 @@ pub(super) fn recognize(bytes: &[u8], name: Option<&str>) -> Result<FileKind, Fo
              four (x y z intensity) or *.pcd.bin for five (x y z intensity ring)"
                 .to_owned(),
         )),
+        (false, false) if is_name(bytes) => Err(FormatError::Unrecognized(
+            "it looks like the name of a file instead of the file; with curl, write @ before the name"
+                .to_owned(),
+        )),
         (false, false) => Err(FormatError::Unrecognized(
             "no known beginning, and neither rows of four floats (x y z intensity in 0..1) nor \
              of five (x y z intensity ring); name it *.kitti.bin or *.pcd.bin to read it anyway"
                 .to_owned(),
         )),
     }
+}
+
+/// Whether the bytes look like a file's name: one short line of text with a dot in it.
+fn is_name(bytes: &[u8]) -> bool {
+    const LONGEST: usize = 255;
+    let is_of_name = |byte: &u8| byte.is_ascii_graphic() || *byte == b' ';
+    bytes.len() <= LONGEST && bytes.iter().all(is_of_name) && bytes.contains(&b'.')
 }
 
 fn plausible(bytes: &[u8], kind: FileKind) -> bool {

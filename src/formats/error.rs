@@ -66,7 +66,7 @@ impl fmt::Display for FileKind {
 pub enum FormatError {
     /// The content is of no kind that the function reads; with the reason.
     #[error(
-        "unrecognized file: {0}; known are npy, npz, ply, pcd, feather, las, kitti bin and nuscenes bin, and json for a flow"
+        "unrecognized file: {0}; known are npy, npz, ply, pcd, feather, las, laz, kitti bin and nuscenes bin, and json for a flow"
     )]
     Unrecognized(String),
     /// The content can be read in several ways, and neither the content nor the name decides

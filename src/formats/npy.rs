@@ -212,8 +212,12 @@ pub(super) fn read_points<R: Read + ?Sized>(
     let (rows, columns) = match header.table() {
         Some((rows, columns)) if columns >= 3 && header.scalar.is_float() => (rows, columns),
         _ => {
+            let numbers = match header.scalar.is_float() {
+                true => "floats",
+                false => "integers",
+            };
             return Err(kind.unsupported(format!(
-                "{} has shape {:?} and {} bytes a number where N x 3 floats are needed",
+                "{} has shape {:?} of {numbers} with {} bytes each, where N x 3 floats are needed",
                 array_path.described(),
                 header.shape,
                 header.scalar.size()

@@ -32,8 +32,8 @@ pub struct Report {
     pub dt_assumed: bool,
     /// Why the method ended: `completed`, `converged`, `max_iterations` or `deadline`.
     pub stop_reason: String,
-    /// The device that computed the method: that of the field's fit, or the host's threads for
-    /// objects.
+    /// The device that computed the method: that of the field's fit, the GPU that searched the clusters
+    /// of objects, or the host's threads.
     pub device: String,
     /// The ego motion target_from_source as a 4 x 4 matrix, row by row, translation in metres. None
     /// if it was not separated, or a deadline left no time to estimate it.
@@ -53,8 +53,9 @@ pub struct Report {
     /// Deskewing of the two sweeps, where the times of their points are known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub deskew: Option<DeskewReport>,
-    /// What is suspicious about the input, in words: both sweeps are the same points, they share
-    /// little of what they show, or they hardly determine the ego motion.
+    /// What is suspicious about the result, in words: both sweeps are the same points, they lie far
+    /// from the origin, they share little of what they show, they hardly determine the ego motion, or
+    /// a deadline left no time for it.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub warnings: Vec<String>,
     /// The object search, with `default` and `label`.
@@ -245,7 +246,7 @@ fn decimal(seconds: f32) -> f64 {
     shortest.unwrap_or_else(|_| seconds.into())
 }
 
-/// What is suspicious about the sweeps of an estimate, in words.
+/// What is suspicious about an estimate, in words.
 pub fn warnings(estimate: &Estimate) -> Vec<String> {
     let same = estimate
         .same_sweep
@@ -262,7 +263,24 @@ pub fn warnings(estimate: &Estimate) -> Vec<String> {
         )
     });
     let unsure = estimate.ego_covariance.as_ref().and_then(undetermined);
-    same.into_iter().chain(little).chain(unsure).collect()
+    let rough = estimate.ego_is_rough.then(|| {
+        let found = match estimate.ego {
+            Some(_) => "the ego motion is rough",
+            None => "there is no ego motion",
+        };
+        format!("the deadline left too little time: {found}, and all confidences are 0")
+    });
+    let off_origin = estimate.is_off_origin.then(|| {
+        "the sweep lies far from the origin of its frame: use the frame of the sensor or the \
+         vehicle, or ground and moving objects are missed"
+            .to_owned()
+    });
+    same.into_iter()
+        .chain(off_origin)
+        .chain(little)
+        .chain(unsure)
+        .chain(rough)
+        .collect()
 }
 
 /// What the sweeps hardly determine of the ego motion along the ground, in words. Height, pitch and
@@ -298,6 +316,8 @@ mod tests {
             valid: Vec::new(),
             dynamic: None,
             overlap: Some(0.5),
+            ego_is_rough: false,
+            is_off_origin: false,
             same_sweep: true,
             ego: None,
             ego_covariance: Some(Matrix6::identity()),

@@ -350,7 +350,7 @@ impl Worker {
         let predicted = self.cost.seconds_on(self.lane.kind(), job.cost_seconds);
         let ratio = took.as_secs_f64() / predicted.max(1e-6);
         self.metrics.solved(estimate.stop_reason.name(), ratio);
-        // An estimate by objects runs on the host, so its time gives no information about the GPU.
+        // An estimate by objects runs mostly on the host, so its time tells little of the GPU.
         let elsewhere = estimate.objects().is_some() && self.lane.kind() != DeviceKind::Cpu;
         if !resumed && !cut && !elsewhere {
             self.cost

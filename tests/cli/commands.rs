@@ -180,7 +180,9 @@ fn doctor_names_the_devices_and_help_teaches() {
 #[test]
 fn wrong_arguments_are_refused_with_exit_code_2_before_any_work() {
     let folder = tempfile::tempdir().expect("a folder");
-    let refused: [&[&str]; 7] = [
+    std::fs::write(folder.path().join("sweep_0003.pcd"), "").expect("a file");
+    let refused: [&[&str]; 8] = [
+        &["synth", "-o", ".", "--sweeps", "3"],
         &["flow"],
         &["flow", "a.npz"],
         &["flow", "a.npz", "-o", "flow.xyz"],
@@ -272,6 +274,9 @@ fn clouds_far_from_the_origin_align_as_near_ones_do() {
     );
     let turn = |report: &serde_json::Value| report["ego_motion"][1][0].as_f64().expect("a number");
     assert!((turn(&near) - turn(&far)).abs() < 1e-3, "{near} {far}");
+    assert!(near["warnings"].is_null(), "{near}");
+    let warned = far["warnings"].to_string();
+    assert!(warned.contains("far from the origin"), "{warned}");
 }
 
 #[test]

@@ -327,7 +327,10 @@ fn tracks_of_another_sequence_and_sweeps_of_one_name_are_refused_before_anything
     drive(folder);
     let [one, two, three, _] = sweeps();
     for (sweeps, said) in [
-        ([&one, &two, &three], "the last of the 3 given is sweep 2"),
+        (
+            [&one, &two, &three],
+            "of 3 given sweeps the last is sweep 2",
+        ),
         ([&one, &two, &one], "two sweeps have the name sweep_0000"),
     ] {
         let sweeps = sweeps.map(String::as_str);

@@ -198,6 +198,7 @@ fn a_pair_whose_parts_disagree_is_refused() {
 fn strangers_are_named() {
     let named = |bytes: &[u8]| refusal(bytes).to_string();
     assert!(named(b"").contains("empty"));
+    assert!(named(b"sweeps/a.pcd").contains("write @ before the name"));
     assert!(named(b"LASF....").contains("las"));
     assert!(named(b"\x1f\x8b\x08").contains("gzip"));
     assert!(named(b"\x80\x04\x95").contains("pickle"));

@@ -254,12 +254,12 @@ fn what_the_server_refuses_is_said_in_its_words() {
         ),
         (KEY, &["jobs", "show", unknown], 70, "no job has this name"),
         (KEY, &["jobs", "show", "../info"], 70, "server answered"),
-        (KEY, &["jobs", "list", "--state", "lost"], 70, "lost"),
+        (KEY, &["jobs", "list", "--state", "lost"], 2, "lost"),
         (KEY, &["jobs", "requeue"], 2, "required"),
         (
             KEY,
             &["submit", "a.pcd", "a.pcd", "-o", "f.npz"],
-            70,
+            65,
             "unrecognized file",
         ),
         (
@@ -269,7 +269,8 @@ fn what_the_server_refuses_is_said_in_its_words() {
             "missing.pcd",
         ),
         (KEY, &["submit", "a.pcd", "a.pcd"], 2, "--output"),
-        (KEY, &["jobs", "--server", "ftp://a", "list"], 2, "ftp://a"),
+        (KEY, &["jobs", "list", "--server", "ftp://a"], 2, "ftp://a"),
+        (KEY, &["jobs", "list", "--server", "a:80"], 2, "http://"),
         (
             KEY,
             &["jobs", "--server", "http://127.0.0.1:9", "list"],

@@ -76,6 +76,9 @@ async fn a_pair_comes_back_as_the_librarys_flow_in_every_format() {
         if format == Some(FlowFormat::Json) {
             let json: Value = serde_json::from_slice(&bytes).expect("JSON");
             assert_eq!(json["stop_reason"], "completed");
+            let warnings = json["warnings"].as_array().expect("of a small pair");
+            let warnings: Vec<&str> = warnings.iter().filter_map(Value::as_str).collect();
+            assert_eq!(headers["fnsf-warnings"], warnings.join("; ").as_str());
             assert_eq!(
                 json["job_id"].as_str(),
                 headers["fnsf-job-id"].to_str().ok()

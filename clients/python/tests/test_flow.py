@@ -146,6 +146,7 @@ CLOUD = np.random.default_rng(0).uniform(-20, 20, (1000, 3)).astype(np.float32)
     ("source", "options", "said"),
     [
         (CLOUD[:, :2], {}, r"pc1 has shape \(1000, 2\): N x 3 is needed"),
+        (CLOUD.T, {}, r"pc1 has shape \(3, 1000\), but each row is a point"),
         (CLOUD[0], {}, r"pc1 has shape \(3,\)"),
         (np.array([["a", "b", "c"]]), {}, "pc1 has type <U1: numbers are needed"),
         (CLOUD + 1j, {}, "pc1 has type complex64"),

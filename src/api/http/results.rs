@@ -27,7 +27,7 @@ use crate::sync::locked;
 pub(super) const ARCHIVE: &str = "application/zip";
 
 /// The headers of responses with results, and their meanings.
-pub(super) const RESULT_HEADERS: [(&str, &str); 8] = [
+pub(super) const RESULT_HEADERS: [(&str, &str); 9] = [
     ("Fnsf-Job-Id", "The id of the job."),
     ("Fnsf-Stop-Reason", "Of a flow: why the estimate stopped."),
     ("Fnsf-Seconds", "Compute time, seconds."),
@@ -40,6 +40,10 @@ pub(super) const RESULT_HEADERS: [(&str, &str); 8] = [
         "Of an object search: the number of clusters.",
     ),
     ("Fnsf-Iterations", "Of a fit: the number of iterations."),
+    (
+        "Fnsf-Warnings",
+        "Of a flow: the warnings of the report, with semicolons between them.",
+    ),
     (
         "ETag",
         "The entity tag of the result, for If-None-Match and If-Range.",
@@ -93,6 +97,9 @@ impl Head {
                 .field
                 .map(|f| ("fnsf-iterations", f.iterations.to_string())),
         );
+        if !report.warnings.is_empty() {
+            own.push(("fnsf-warnings", report.warnings.join("; ")));
+        }
         Ok(Self {
             job: Arc::clone(job),
             media_type: format.media_type(),

@@ -32,12 +32,12 @@ fn print_text(name: Option<&str>, metrics: &TrackingMetrics) -> Result<(), Failu
     let [truth, found] = [metrics.truth, metrics.found];
     show(format_args!("{}", name.unwrap_or("all")))?;
     show(format_args!(
-        "  objects x sweeps  {}, {:.1}% found",
+        "  true boxes        {}, recall {:.1}%",
         grouped(truth),
         percent(truth)
     ))?;
     show(format_args!(
-        "  found             {}, {:.1}% right",
+        "  found boxes       {}, precision {:.1}%",
         grouped(found),
         percent(found)
     ))?;

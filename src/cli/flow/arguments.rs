@@ -46,11 +46,12 @@ pub(in crate::cli) struct Flow {
     /// Print the report of each pair as one JSON object on stdout, instead of text
     #[arg(long)]
     pub(super) json: bool,
-    /// Lead sweeps whose points have times (a field offset_ns, t, time or timestamp of ply, pcd and
-    /// feather) to one instant by the ego motion. auto: where the two sweeps of a pair then fit
-    /// clearly better, which they do not if they were deskewed before. on: always. off: the times are
-    /// not read. A deskewed flow starts from the deskewed points, and they are in the files that hold
-    /// points. With times, objects move for the real time between their points
+    /// Transform sweeps whose points have times (a field offset_ns, t, time, timestamp, offset_time or
+    /// time_offset of ply, pcd and feather, or the times of LAS) to one time by the ego motion. auto:
+    /// where the two sweeps of a pair then fit clearly better, which they do not if they were deskewed
+    /// before. on: always. off: the times are not read. A deskewed flow starts from the deskewed points,
+    /// and they are in the files that hold points. With times, objects move for the real time between
+    /// their points
     #[arg(long, value_enum, default_value_t)]
     pub(super) deskew: DeskewChoice,
     #[command(flatten)]

@@ -338,7 +338,7 @@ impl fmt::Display for Latencies {
         write!(
             f,
             "{total} flows, each after its sweep by {median} ms (median), {most} ms (99%), {:.0} ms (most)",
-            self.longest_s * 1e3
+            (self.longest_s * 1e3).ceil()
         )
     }
 }

@@ -92,7 +92,7 @@ impl Flow {
                 }
                 Err(failure) if failure.is_of_input() => {
                     pairs.flush_or_warn()?;
-                    warn(&arrived.path.display(), &failure);
+                    warn(&failure);
                     pairs.restart();
                 }
                 Err(failure) => return Err(failure),

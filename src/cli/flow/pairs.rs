@@ -168,7 +168,7 @@ impl<'a> Pairs<'a> {
                 && let Some(refused) = self.waiting.pop_front()
             {
                 let [source, target] = &refused.names;
-                warn(&format_args!("{source} to {target}"), failure);
+                warn(&format_args!("{source} to {target}: {failure}"));
                 let waiting = core::mem::take(&mut self.waiting).into_iter();
                 let mut waiting: VecDeque<_> = waiting.map(|one| (one.sweep, one.target)).collect();
                 waiting.append(&mut later);
@@ -290,9 +290,9 @@ impl Control for Due<'_> {
     }
 }
 
-/// Warns that `what`, a sweep or a pair, cannot be used.
-pub(super) fn warn(what: &dyn fmt::Display, failure: &Failure) {
+/// Warns of a sweep or a pair that cannot be used.
+pub(super) fn warn(failure: &dyn fmt::Display) {
     complain(format_args!(
-        "warning: {what}: {failure}; the sequence starts again after it"
+        "warning: {failure}; the sequence starts again after it"
     ));
 }

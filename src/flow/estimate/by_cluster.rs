@@ -18,7 +18,7 @@ use crate::flow::motion::{Residual, SampledMotion};
 use crate::flow::options::{FieldOptions, PartitionOptions};
 use crate::flow::spatial::dbscan;
 
-/// A cluster with fewer points than this, or fewer candidates in the target, is static.
+/// A cluster is static if its fit has fewer target points than this.
 const LEAST_POINTS: usize = 4;
 
 /// Estimates the residual motion by a fit for each cluster, the largest first. Clusters that the

@@ -13,7 +13,7 @@ use crate::flow::objects::{ClusterDevice, Objects, PackedScene, SearchClouds, Ti
 use crate::flow::options::ObjectOptions;
 
 /// Estimates the residual motion by an object search. The device finds the normals and searches the
-/// clusters if it has kernels for it, and the host's threads do the rest.
+/// clusters if it has kernels for it and memory, and the host's threads do the rest.
 ///
 /// # Errors
 /// [`FlowError`] where the ground mask of a neighbor sweep is rejected, the control cancels, or the
@@ -62,7 +62,10 @@ pub(super) fn residual_motion(
         |scene: &PackedScene, is_over: &dyn Fn() -> bool| backend.search_clusters(scene, is_over);
     let device: Option<&ClusterDevice<'_, BackendError>> =
         backend.searches_clusters().then_some(&on_device);
-    let mut search = host.find_objects_with(&clouds, options, device, control)?;
+    let mut search = match host.find_objects_with(&clouds, options, device, control) {
+        Err(error) if error.is_out_of_memory() => host.find_objects(&clouds, options, control),
+        found => found?,
+    };
     if search.interrupted == Some(Interrupt::Cancelled) {
         return Err(FlowError::Cancelled);
     }

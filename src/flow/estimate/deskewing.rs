@@ -13,7 +13,7 @@ use crate::flow::registration::Registration;
 use crate::flow::select::{cropped, ground_masks};
 
 /// Remaining time above which a pair is deskewed, seconds per point. It takes two registrations.
-const SECONDS_PER_POINT: f64 = 1e-5;
+const SECONDS_PER_POINT: f64 = 2e-6;
 
 /// The distance of the deskewed sweeps is at most this share of that of the sweeps as they were given
 /// where they are used. At 10 m/s the two hardly differ, and nor do the flows.

@@ -12,7 +12,7 @@ use crate::flow::select::Selection;
 const SAMPLED_POINTS: usize = 8192;
 /// Remaining time per point above which all points are registered, seconds. Used where the speed of
 /// the machine has not been measured. It is four times the cost on a slow core.
-const SECONDS_PER_POINT: f64 = 2e-6;
+const SECONDS_PER_POINT: f64 = 5e-7;
 
 /// Whether the remaining time allows a registration of all points of the selection.
 pub(super) fn has_time_for_all(selection: &Selection, control: &dyn Control) -> bool {
@@ -36,8 +36,8 @@ pub(super) fn prior(problem: &Problem, options: &Options) -> RigidTransform {
     before.and_then(|field| field.ego).unwrap_or_default()
 }
 
-/// The ego motion as target_from_source, with `prior` as the initial guess; none with [`Ego::Off`].
-/// That of [`Ego::Given`] has no covariance.
+/// The ego motion as target_from_source, with `prior` as the initial guess; none with [`Ego::Off`], and
+/// where no time is left for a registration. That of [`Ego::Given`] has no covariance.
 ///
 /// Uses all points of the registration clouds if `whole` is set, otherwise a sample. At a deadline
 /// the registration returns its motion so far.
@@ -56,6 +56,7 @@ pub(super) fn ego_motion(
     let align = |[source, target]: [&[Point]; 2]| host.align(source, target, prior, &on_time);
     match (ego, &selection.registration_clouds) {
         (Ego::Given(motion), _) => Some(Registration::given(motion)),
+        (Ego::Auto, Some(_)) if on_time.interrupt().is_some() => None,
         (Ego::Auto, Some([source, target])) if whole => Some(align([source, target])),
         (Ego::Auto, Some(clouds)) => {
             let [source, target] = clouds

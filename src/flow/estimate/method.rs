@@ -40,7 +40,7 @@ impl Input<'_> {
         let Selection {
             source,
             target,
-            undrawn,
+            unsampled,
             has_ground,
             ..
         } = self.selection;
@@ -51,10 +51,10 @@ impl Input<'_> {
             Some(motion) => transform_points(motion, points),
         };
         let aligned = moved(source);
-        let clouds = undrawn
+        let clouds = unsampled
             .as_ref()
             .map_or([source, target], |[source, target]| [source, target]);
-        let measure = || match (has_ground, undrawn) {
+        let measure = || match (has_ground, unsampled) {
             (false, None) => overlap(&aligned, target),
             (false, Some([source, target])) => overlap(&moved(source), target),
             (true, _) => {

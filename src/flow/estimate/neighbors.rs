@@ -12,7 +12,7 @@ use crate::flow::select::{cropped, select_neighbor};
 
 /// Remaining time required for a neighbor sweep, seconds per point of it and of the target.
 /// Neighbor sweeps are the first work that a deadline drops.
-const SECONDS_PER_POINT: f64 = 2e-5;
+const SECONDS_PER_POINT: f64 = 2e-6;
 
 /// The neighbor sweeps of the problem that the options use and the remaining time allows, in the
 /// target's frame, and whether time was left for all of them. `ego` is the ego motion of the pair,

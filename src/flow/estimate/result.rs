@@ -28,6 +28,9 @@ pub struct Estimate {
     /// frame (x, y, z, metres) and of the rotation about the target's axes (x, y, z, radians). None
     /// without an ego motion, where it is given, and where a deadline left no time for it.
     pub ego_covariance: Option<Matrix6<f64>>,
+    /// Whether a deadline left no time to finish the registration. The ego motion is then none or
+    /// rough, and all confidences and probabilities of motion are zero.
+    pub ego_is_rough: bool,
     /// Overlap of the two sweeps after the ego motion, 0 to 1: the share of the volume off the ground
     /// of the source that the target shows as well, within 0.3 m. Below
     /// [`crate::flow::LEAST_OVERLAP`] it is the larger of the shares of the two sweeps. None for
@@ -36,6 +39,9 @@ pub struct Estimate {
     /// The deskewing of the two sweeps. None where the times of their points are unknown, without an
     /// ego motion, while the vehicle stands, and where a deadline left no time for it.
     pub deskew: Option<Deskew>,
+    /// Whether the source lies far from the origin of its frame, where the sensor should be. Ground and
+    /// moving objects are then missed.
+    pub is_off_origin: bool,
     /// Whether both sweeps are the same points in the same order.
     pub same_sweep: bool,
     /// Number of points that took part and have a flow. Ground points with the ego-motion flow
@@ -45,8 +51,8 @@ pub struct Estimate {
     pub solution: Solution,
     /// The reason why the method ended.
     pub stop_reason: StopReason,
-    /// Name of the processor that ran the method, for reports: the device of a field, or the host's
-    /// threads for objects.
+    /// Name of the processor that ran the method, for reports: the device of a field, the GPU that
+    /// searched the clusters of objects, or the host's threads.
     pub device: String,
     /// Seconds of the first stage, by the control's clock: deskewing, selection, ground segmentation,
     /// and beside it the downsampling for the registration. Zero if the control keeps no time.

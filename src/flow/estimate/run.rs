@@ -23,8 +23,8 @@ use crate::flow::problem::Problem;
 use crate::flow::select::select;
 
 /// Estimates the motion of the source points that `options` select; the other points get no flow. A
-/// field and its distance transform are computed on `backend`. All other stages run on its
-/// [`Backend::host`].
+/// field and its distance transform are computed on `backend`, and so is the search of clusters if it
+/// has kernels for it. All other stages run on its [`Backend::host`].
 ///
 /// A deadline is not an error: the result is the best flow that the time allows.
 ///
@@ -75,6 +75,7 @@ fn estimate_from(
     let deskewed = deskew(backend.host(), problem, options, control)?;
     let lacks_deskew = deskewed.is_none() && has_deskew(problem, options);
     let given = [problem.source, problem.target];
+    let estimates_ego = options.ego == Ego::Auto;
     let (mut problem, mut options) = (*problem, Cow::Borrowed(options));
     let mut is_deskewed = false;
     let neighbors;
@@ -128,6 +129,12 @@ fn estimate_from(
         estimate.ego_covariance = pair.ego.covariance;
         estimate.deskew = pair.deskew;
     }
+    estimate.ego_is_rough = estimates_ego && estimate.ego_covariance.is_none();
+    if estimate.ego_is_rough
+        && let Solution::Objects(solution) = &mut estimate.solution
+    {
+        solution.objects.scale_probabilities(0.0);
+    }
     Ok(estimate)
 }
 
@@ -157,7 +164,7 @@ fn assemble(
     let mut flow = vec![[0.0; 3]; source.len()];
     let mut valid = vec![false; source.len()];
     let mut dynamic = ego.map(|_| vec![false; source.len()]);
-    for &i in &selection.output_rows {
+    for &i in &selection.output_indices {
         let row = selection.rows[i];
         let (from, to, residual) = (selection.source[i], aligned[i], residual[i]);
         flow[row] = core::array::from_fn(|a| (to[a] - from[a]) + residual[a]);
@@ -174,7 +181,7 @@ fn assemble(
             dynamic[row] = false;
         }
     }
-    let output = selection.output_rows.iter();
+    let output = selection.output_indices.iter();
     let points = output.filter(|&&i| valid[selection.rows[i]]).count();
     let mut objects = match &mut solution {
         Solution::Objects(solution) => Some(&mut solution.objects),
@@ -212,8 +219,10 @@ fn assemble(
         dynamic,
         ego,
         ego_covariance,
+        ego_is_rough: false,
         overlap,
         deskew: None,
+        is_off_origin: selection.is_off_origin,
         // By bits, because points may be no numbers.
         same_sweep: cast_slice::<Point, u8>(source)
             == cast_slice::<Point, u8>(input.problem.target),

@@ -16,6 +16,7 @@ use crate::flow::error::FlowError;
 use crate::flow::field::{Backend, BackendError, Network, PreparedTarget};
 use crate::flow::host::Host;
 use crate::flow::motion::{MotionField, Residual};
+use crate::flow::objects::{FoundInScene, PackedScene};
 use crate::flow::options::Options;
 use crate::flow::options::{Ego, Ground, LossOptions, Preset};
 use crate::flow::problem::Problem;
@@ -201,6 +202,19 @@ impl Backend for Scarce {
         self.cpu.host()
     }
 
+    fn searches_clusters(&self) -> bool {
+        true
+    }
+
+    fn search_clusters(
+        &self,
+        _: &PackedScene,
+        _: &dyn Fn() -> bool,
+    ) -> Result<FoundInScene, BackendError> {
+        self.refused.fetch_add(1, Ordering::Relaxed);
+        Err(BackendError::Busy)
+    }
+
     fn prepare_target(
         &self,
         source: &[Point],
@@ -334,6 +348,37 @@ fn ground_that_is_kept_is_no_overlap_of_two_scenes() {
         }
     });
     assert_eq!(overlaps[0], overlaps[1]);
+}
+
+#[test]
+fn a_device_without_memory_leaves_the_clusters_to_the_host() {
+    let pair = street();
+    let problem = Problem::pair(&pair.source, &pair.target);
+    let options = Preset::Default.options(None);
+    let device = Scarce::new(0.0);
+    let [of_device, of_host] = [&device as &dyn Backend, &device.cpu]
+        .map(|backend| estimate(backend, &problem, &options, &Uncontrolled).expect("a flow"));
+    assert_eq!(device.refused.load(Ordering::Relaxed), 1);
+    assert_eq!(of_device.device, device.cpu.host().name());
+    assert_eq!(of_device.flow, of_host.flow);
+    assert_eq!(of_device.objects(), of_host.objects());
+}
+
+#[test]
+fn nothing_is_certain_where_a_deadline_cuts_the_registration_short() {
+    let pair = street();
+    let problem = Problem::pair(&pair.source, &pair.target);
+    let backend = CpuBackend::new(Some(2)).expect("threads");
+    let options = Preset::Default.options(None);
+    let late = After(0, Interrupt::Deadline, AtomicUsize::new(0));
+    let found = estimate(&backend, &problem, &options, &late).expect("a flow");
+    assert_eq!(found.stop_reason, StopReason::Deadline);
+    assert_eq!((found.ego, found.ego_is_rough), (None, true));
+    let objects = found.objects().expect("objects");
+    let all = objects.confidence.iter().chain(&objects.moving);
+    assert!(all.copied().all(|probability| probability == 0.0));
+    let found = estimate(&backend, &problem, &options, &Uncontrolled).expect("a flow");
+    assert!(!found.ego_is_rough && found.ego_covariance.is_some());
 }
 
 #[test]

@@ -47,6 +47,20 @@ impl Store {
     }
 }
 
+/// A request's place in the queue, until it is dropped.
+struct Place<'a> {
+    allocator: &'a Allocator,
+    ticket: u64,
+}
+
+impl Drop for Place<'_> {
+    fn drop(&mut self) {
+        let mut store = self.allocator.store();
+        store.line.retain(|&other| other != self.ticket);
+        self.allocator.moved.notify_all();
+    }
+}
+
 impl Allocator {
     pub(super) fn new(words: u64) -> Self {
         Self {
@@ -83,35 +97,41 @@ impl Allocator {
                 available: self.all * 4,
             });
         }
-        let mut store = self.store();
-        let own = store.next;
-        store.next += 1;
-        store.line.push_back(own);
+        let place = self.place_in_line();
         let mut waited = Duration::ZERO;
-        let index = loop {
-            if store.line.front() == Some(&own)
+        let mut store = self.store();
+        loop {
+            if store.line.front() == Some(&place.ticket)
                 && let Some(index) = store.taken(count)
             {
-                break Ok(index);
+                return Ok(index);
             }
             if waited >= PATIENCE {
-                break Err(BackendError::Busy);
-            }
-            if let Err(interrupt) = control::check(control) {
-                break Err(BackendError::Interrupted(interrupt));
+                return Err(BackendError::Busy);
             }
             let (woken, timeout) = self
                 .moved
                 .wait_timeout(store, POLL_INTERVAL)
                 .unwrap_or_else(PoisonError::into_inner);
-            store = woken;
+            drop(woken);
             if timeout.timed_out() {
                 waited += POLL_INTERVAL;
             }
-        };
-        store.line.retain(|&other| other != own);
-        self.moved.notify_all();
-        index
+            control::check(control).map_err(BackendError::Interrupted)?;
+            store = self.store();
+        }
+    }
+
+    /// A place at the end of the queue.
+    fn place_in_line(&self) -> Place<'_> {
+        let mut store = self.store();
+        let ticket = store.next;
+        store.next += 1;
+        store.line.push_back(ticket);
+        Place {
+            allocator: self,
+            ticket,
+        }
     }
 
     /// Releases `count` words at offset `index`.
@@ -136,6 +156,7 @@ impl Allocator {
 
 #[cfg(test)]
 mod tests {
+    use std::panic::catch_unwind;
     use std::sync::atomic::{AtomicBool, Ordering};
 
     use super::*;
@@ -172,6 +193,22 @@ mod tests {
         words.take("points", 60, &Uncontrolled).expect("free");
         let interrupted = words.take("points", 60, &Over);
         assert!(matches!(interrupted, Err(BackendError::Interrupted(_))));
+    }
+
+    #[test]
+    fn a_request_whose_control_panics_leaves_the_line() {
+        struct Panics;
+        impl Control for Panics {
+            fn interrupt(&self) -> Option<Interrupt> {
+                unreachable!("as a control of a caller may")
+            }
+        }
+        let words = Allocator::new(100);
+        let taken = words.take("points", 60, &Uncontrolled).expect("free");
+        let panicked = catch_unwind(|| words.take("points", 80, &Panics));
+        assert!(panicked.is_err());
+        words.take("points", 40, &Over).expect("nobody waits");
+        words.give_back(taken, 60);
     }
 
     #[test]

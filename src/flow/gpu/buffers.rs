@@ -106,7 +106,7 @@ impl Buffers {
             activations: buffer("activations", budget.row_bytes(), storage)?,
             deltas: buffer("deltas", budget.row_bytes(), storage)?,
             flows: buffer("flows", row_vectors, storage)?,
-            loss_gradients: buffer("pulls", row_vectors, storage)?,
+            loss_gradients: buffer("loss gradients", row_vectors, storage)?,
             partials: buffer("gradients", budget.chunk_bytes(), storage)?,
             lanes: buffer("lanes", records(size_of::<layout::Lane>()), storage | to)?,
             steps: buffer(

@@ -20,7 +20,7 @@ pub(super) const GROUP: u32 = 512;
 pub(super) const GROUP_BYTES: u32 = 32 << 10;
 /// Most workgroups of a dispatch; each takes further clusters in turn. And most bytes of their
 /// scratch.
-const MOST_GROUPS: u64 = 1024;
+const SEARCH_GROUPS: u64 = 1024;
 const SCRATCH_BYTES: u64 = 64 << 20;
 /// Storage buffers of a kernel.
 const STORAGE_BUFFERS: u32 = 8;
@@ -184,7 +184,7 @@ impl Search<'_> {
         let context = self.context;
         let clusters = packed.clusters.len();
         let scratch = u64::from(packed.scene.scratch_words) * 4;
-        let groups = MOST_GROUPS.min(SCRATCH_BYTES / scratch.max(1)).max(1);
+        let groups = SEARCH_GROUPS.min(SCRATCH_BYTES / scratch.max(1)).max(1);
         let groups = groups.min(clusters as u64);
         let [words, scene, views, points, records] = context.all_filled([
             bytemuck::cast_slice(&packed.words),
@@ -203,21 +203,16 @@ impl Search<'_> {
         let of_normals = [&words, &scene, &views, &points, &normals];
         let of_search = [&records, &scratch, &results];
         let of_search: Vec<_> = of_normals.into_iter().chain(of_search).collect();
-        let of_normals = context.bound(&self.kernels.normals, &of_normals);
-        // A submission for each view, as for other long searches: in a tall heap of points each is near
-        // to all others, and drivers give up on a submission that takes seconds.
-        for (view, targets) in (0_u32..).zip(targets) {
-            let mut encoder = context.encoder();
-            {
-                let untimed = wgpu::ComputePassDescriptor::default();
-                let mut pass = encoder.begin_compute_pass(&untimed);
-                pass.set_pipeline(&self.kernels.normals);
-                pass.set_bind_group(0, &of_normals, &[]);
-                pass.set_immediates(0, bytemuck::bytes_of(&view));
-                pass.dispatch_workgroups(targets.div_ceil(NORMALS_GROUP) as u32, 1, 1);
-            }
-            context.queue.submit([encoder.finish()]);
+        let mut encoder = context.encoder();
+        {
+            let untimed = wgpu::ComputePassDescriptor::default();
+            let mut pass = encoder.begin_compute_pass(&untimed);
+            let groups = targets.max().unwrap_or(0).div_ceil(NORMALS_GROUP);
+            pass.set_pipeline(&self.kernels.normals);
+            pass.set_bind_group(0, &context.bound(&self.kernels.normals, &of_normals), &[]);
+            pass.dispatch_workgroups(groups as u32, packed.views.len() as u32, 1);
         }
+        context.queue.submit([encoder.finish()]);
         Ok(UploadedScene {
             group: context.bound(&self.kernels.search, &of_search),
             results,
@@ -252,20 +247,17 @@ impl Submit<ScenePart, FoundInScene> for Search<'_> {
                 pass.dispatch_workgroups(of_scene.groups, 1, 1);
             }
         }
-        let sizes = parts.iter().map(|of_scene| of_scene.bytes());
-        let bytes = sizes.clone().flatten().sum();
-        let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC;
-        let all = self.context.empty(bytes, usage)?;
-        let mut end = 0;
-        for (of_scene, [normals, records]) in parts.iter().zip(sizes.clone()) {
-            if let Some((found, _)) = &of_scene.normals {
-                encoder.copy_buffer_to_buffer(found, 0, &all, end, normals);
-            }
+        let found = parts.iter().flat_map(|of_scene| {
+            let [normals, records] = of_scene.bytes();
             let first = buffer_bytes::<FoundRecord>(of_scene.part.first as usize);
-            encoder.copy_buffer_to_buffer(&of_scene.results, first, &all, end + normals, records);
-            end += normals + records;
-        }
-        let read = self.context.finish(encoder, &all, bytes)?;
+            let of_normals = of_scene.normals.iter();
+            let of_normals = of_normals.map(move |(buffer, _)| (buffer, 0, normals));
+            of_normals.chain([(&of_scene.results, first, records)])
+        });
+        let read = self
+            .context
+            .finish_all(encoder, &found.collect::<Vec<_>>())?;
+        let sizes = parts.iter().map(|of_scene| of_scene.bytes());
         let mut left = &read[..];
         let mut next = |bytes: u64| left.split_off(..bytes as usize).unwrap_or_default();
         Ok(sizes

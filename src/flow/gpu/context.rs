@@ -235,18 +235,36 @@ impl Context {
     /// As [`Self::finish`], for the bytes of `buffer` from `at` on.
     ///
     /// # Errors
-    /// [`BackendError::Lost`] if the GPU does not answer, and [`BackendError::Busy`] if it has no
-    /// free memory.
+    /// As [`Self::finish_all`].
     pub(super) fn finish_from(
         &self,
-        mut encoder: wgpu::CommandEncoder,
+        encoder: wgpu::CommandEncoder,
         buffer: &wgpu::Buffer,
         at: u64,
         bytes: u64,
     ) -> Result<Vec<u8>, BackendError> {
+        self.finish_all(encoder, &[(buffer, at, bytes)])
+    }
+
+    /// As [`Self::finish`], for parts of several buffers, which follow each other in the result: where
+    /// each begins in its buffer, and its bytes.
+    ///
+    /// # Errors
+    /// [`BackendError::Lost`] if the GPU does not answer, and [`BackendError::Busy`] if it has no
+    /// free memory.
+    pub(super) fn finish_all(
+        &self,
+        mut encoder: wgpu::CommandEncoder,
+        parts: &[(&wgpu::Buffer, u64, u64)],
+    ) -> Result<Vec<u8>, BackendError> {
         let usage = wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST;
-        let staging = self.empty(bytes, usage)?;
-        encoder.copy_buffer_to_buffer(buffer, at, &staging, 0, bytes);
+        let all = parts.iter().map(|&(_, _, bytes)| bytes).sum();
+        let staging = self.empty(all, usage)?;
+        let mut end = 0;
+        for &(buffer, at, bytes) in parts {
+            encoder.copy_buffer_to_buffer(buffer, at, &staging, end, bytes);
+            end += bytes;
+        }
         let submission = self.queue.submit([encoder.finish()]);
         let (mapped, answer) = mpsc::channel();
         staging.map_async(wgpu::MapMode::Read, .., move |result| {
@@ -265,7 +283,7 @@ impl Context {
         }
         let view = staging.get_mapped_range(..);
         let view = view.map_err(|error| BackendError::Device(error.to_string()))?;
-        Ok(view.to_vec())
+        Ok(view[..all as usize].to_vec())
     }
 
     /// Submits the commands of `encoder`, waits for them, and leaves an empty encoder.

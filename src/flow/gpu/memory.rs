@@ -1,5 +1,6 @@
 //! The GPU's memory budget. It is allocated once, when the GPU is opened, and divided among the
-//! buffers. A linear model takes memory of its own, see gpu/linear.rs.
+//! buffers. A linear model and a search of clusters take memory of their own, see gpu/linear.rs and
+//! gpu/cluster_search.rs.
 
 use super::adapter::AdapterKind;
 use super::layout::{ARRAYS, TILE};

@@ -6,7 +6,7 @@
 use core::ops::ControlFlow;
 use core::time::Duration;
 use std::collections::HashMap;
-use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 
 use super::health::Watchdog;
@@ -14,7 +14,7 @@ use crate::flow::data::locked;
 use crate::flow::field::BackendError;
 
 /// How long the submitting thread waits for further requests.
-const MOMENT: Duration = Duration::from_micros(300);
+const BATCHING_WINDOW: Duration = Duration::from_micros(300);
 /// Interval at which a waiting thread asks whether it is over.
 const CHECK_INTERVAL: Duration = Duration::from_millis(200);
 
@@ -100,12 +100,21 @@ impl<R, D> Shared<R, D> {
             };
             if !state.done.contains_key(&ticket) {
                 drop(state);
-                let over = is_over();
+                let over = catch_unwind(AssertUnwindSafe(is_over));
                 state = locked(&self.state);
-                if let Some(over) = over
-                    && state.withdraw(ticket)
-                {
-                    return Ok(ControlFlow::Break(over));
+                match over {
+                    Ok(Some(over)) if state.withdraw(ticket) => {
+                        return Ok(ControlFlow::Break(over));
+                    }
+                    Ok(_) => {}
+                    Err(panic) => {
+                        // Nobody may submit a request whose owner is gone.
+                        while !state.withdraw(ticket) && state.done.remove(&ticket).is_none() {
+                            state = self.waited(state, ticket);
+                        }
+                        drop(state);
+                        resume_unwind(panic);
+                    }
                 }
             }
             if let Some(done) = state.done.remove(&ticket) {
@@ -138,7 +147,7 @@ impl<R, D> Shared<R, D> {
         let incomplete = |state: &mut State<R, D>| how.expects_more(&state.waiting);
         state = self
             .changed
-            .wait_timeout_while(state, MOMENT, incomplete)
+            .wait_timeout_while(state, BATCHING_WINDOW, incomplete)
             .unwrap_or_else(PoisonError::into_inner)
             .0;
         let taken = how.take(&mut state.waiting);
@@ -172,6 +181,19 @@ fn error_of_each(watchdog: &Watchdog, error: &BackendError) -> BackendError {
     match (watchdog.check(), error) {
         (Err(lost), _) => lost,
         (Ok(()), BackendError::Busy) => BackendError::Busy,
+        (Ok(()), BackendError::Unsupported(what)) => BackendError::Unsupported(what),
+        (
+            Ok(()),
+            &BackendError::Memory {
+                what,
+                needed,
+                available,
+            },
+        ) => BackendError::Memory {
+            what,
+            needed,
+            available,
+        },
         (Ok(()), BackendError::Device(text)) => BackendError::Device(text.clone()),
         (Ok(()), error) => BackendError::Device(error.to_string()),
     }
@@ -278,6 +300,35 @@ mod tests {
             assert!(matches!(ended, Err(BackendError::Lost(_))), "{ended:?}");
         }
         assert!(watchdog.check().is_err());
+    }
+
+    #[test]
+    fn a_lack_of_memory_is_one_to_each_request() {
+        let error = BackendError::Memory {
+            what: "work",
+            needed: 2,
+            available: 1,
+        };
+        let of_each = error_of_each(&Watchdog::default(), &error);
+        assert!(of_each.is_out_of_memory(), "{of_each:?}");
+        assert_eq!(of_each.to_string(), error.to_string());
+    }
+
+    #[test]
+    fn a_request_whose_owner_panics_is_withdrawn() {
+        let (how, begins, end) = counted();
+        let shared = Shared::default();
+        let watchdog = Watchdog::default();
+        thread::scope(|scope| {
+            let first = scope.spawn(|| shared.run(&watchdog, 0, &how, &|| None::<()>));
+            begins.recv().expect("a submission");
+            let panics = || -> Option<()> { unreachable!("as a control of a caller may") };
+            let second = || shared.run(&watchdog, 1, &how, &panics);
+            assert!(catch_unwind(AssertUnwindSafe(second)).is_err());
+            assert!(locked(&shared.state).waiting.is_empty());
+            end.send(()).expect("a receiver");
+            assert!(first.join().expect("no panic").is_ok());
+        });
     }
 
     #[test]

@@ -36,22 +36,25 @@ impl core::fmt::Debug for Host {
 }
 
 impl Host {
-    /// Starts `threads` threads, or one for each core. `known` is the instruction set of the CPU
+    /// Starts `threads` threads, or one for each core. `isa` is the instruction set of the CPU
     /// backend that shares the threads, if there is one; it appears in the name.
     ///
     /// # Errors
     /// [`HostError`] where the operating system cannot start the threads.
-    pub(crate) fn new(threads: Option<usize>, known: Option<&str>) -> Result<Self, HostError> {
+    pub(crate) fn new(threads: Option<usize>, isa: Option<&str>) -> Result<Self, HostError> {
         let threads = rayon::ThreadPoolBuilder::new()
             .num_threads(threads.unwrap_or(0))
             .thread_name(|i| format!("fnsf-cpu-{i}"))
             .build()
             .map_err(|error| HostError(error.to_string()))?;
-        let count = threads.current_num_threads();
+        let count = match threads.current_num_threads() {
+            1 => "1 thread".to_owned(),
+            count => format!("{count} threads"),
+        };
         Ok(Self {
-            name: match known {
-                Some(isa) => format!("cpu ({isa}, {count} threads)"),
-                None => format!("cpu ({count} threads)"),
+            name: match isa {
+                Some(isa) => format!("cpu ({isa}, {count})"),
+                None => format!("cpu ({count})"),
             },
             threads: Arc::new(threads),
             sweep_cache: Arc::default(),
@@ -62,10 +65,10 @@ impl Host {
     ///
     /// # Errors
     /// [`HostError`] where the operating system cannot start the threads.
-    pub(crate) fn beside(&self, threads: usize, known: Option<&str>) -> Result<Self, HostError> {
+    pub(crate) fn beside(&self, threads: usize, isa: Option<&str>) -> Result<Self, HostError> {
         Ok(Self {
             sweep_cache: Arc::clone(&self.sweep_cache),
-            ..Self::new(Some(threads), known)?
+            ..Self::new(Some(threads), isa)?
         })
     }
 
@@ -77,8 +80,8 @@ impl Host {
 
     /// Clears the cache of ground masks and surfels, so that a measurement that repeats the same
     /// work computes them again.
-    pub fn forget(&self) {
-        self.sweep_cache.forget();
+    pub fn clear_cache(&self) {
+        self.sweep_cache.clear();
     }
 
     /// Does `work` on these threads: for functions that take no backend and compute in parallel, such

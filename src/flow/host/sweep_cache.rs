@@ -52,7 +52,7 @@ pub(crate) struct SweepCache(Mutex<VecDeque<Arc<CachedSweep>>>);
 
 impl SweepCache {
     /// Removes all sweeps.
-    pub(crate) fn forget(&self) {
+    pub(crate) fn clear(&self) {
         self.sweeps().clear();
     }
 
@@ -145,7 +145,7 @@ mod tests {
         let before = held(&sweep_cache);
         sweep_cache.of(&sweep(POINTS + 1, 0.0));
         assert_eq!(held(&sweep_cache), before);
-        sweep_cache.forget();
+        sweep_cache.clear();
         assert_eq!(held(&sweep_cache), 0);
         for few in 0..=SWEEPS as u16 {
             sweep_cache.of(&sweep(3, few.into()));

@@ -17,6 +17,8 @@ use crate::flow::spatial::{NOISE, around};
 
 /// Points of a cluster from which moving objects beside it are searched.
 const LOOKING: usize = 64;
+/// Moving objects up to which a position is compared with the rectangle around each.
+const FEW_MOVERS: usize = 64;
 /// Margin by which a cluster's own motion must be better than that of a larger moving object beside
 /// it, metres.
 const BETTER_M: f32 = 0.05;
@@ -106,7 +108,7 @@ impl<'a> Movers<'a> {
         let holds = |[low, high]: &[[f32; 2]; 2]| {
             low[0] <= x && x <= high[0] && low[1] <= y && y <= high[1]
         };
-        if !self.around.iter().any(holds) {
+        if self.around.len() <= FEW_MOVERS && !self.around.iter().any(holds) {
             return;
         }
         let within_m = self.scene.options.match_m;

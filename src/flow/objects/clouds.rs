@@ -9,9 +9,6 @@ use crate::flow::data::Point;
 use crate::flow::options::ObjectOptions;
 use crate::flow::spatial::{ColumnIndex, SlotLabels, dbscan, voxel_first};
 
-/// Bound on the points of a column of an index. At the usual voxels a wall would have to be 58 m high.
-const MOST_IN_A_COLUMN: usize = 4096;
-
 /// The source with the ego motion taken out, voxel-downsampled.
 pub(super) struct SourceCloud {
     /// One point a voxel, metres in the target's frame.
@@ -32,7 +29,7 @@ impl SourceCloud {
     pub(super) fn new(source: &[Point], labels: &[u32], options: &ObjectOptions) -> Self {
         let kept = voxel_first(source, options.voxel_m);
         let cloud = Self::of(&kept, source, labels, options);
-        match cloud.near.uncrowded_rows(MOST_IN_A_COLUMN) {
+        match cloud.near.uncrowded_rows() {
             None => cloud,
             Some(rows) => {
                 let kept: Vec<u32> = rows.iter().map(|&row| kept[row as usize]).collect();
@@ -93,11 +90,7 @@ impl TargetCloud {
             .into_iter()
             .map(|row| target[row as usize])
             .collect();
-        let mut upright = ColumnIndex::sorted(&mut points, column_m(options));
-        if let Some(rows) = upright.uncrowded_rows(MOST_IN_A_COLUMN) {
-            points = rows.iter().map(|&row| points[row as usize]).collect();
-            upright = ColumnIndex::sorted(&mut points, column_m(options));
-        }
+        let upright = ColumnIndex::sorted_uncrowded(&mut points, column_m(options));
         let low: Vec<Point> = points.iter().map(|&p| lowered(p, options)).collect();
         Self {
             upright: Some(upright),

@@ -11,7 +11,7 @@ use super::scene::Scene;
 use crate::flow::data::stride_sample;
 
 /// Points of a cluster that costs are computed from, and of the sweep around it.
-const JUDGED: usize = 200;
+pub(super) const JUDGED: usize = 200;
 /// Points between two checks of whether a cost is already too high.
 const JUDGED_AT_ONCE: usize = 16;
 

@@ -108,7 +108,7 @@ impl Columns {
         let mut sums = vec![[0.0_f64; 2]; AZIMUTHS];
         for (&point, &time) in points.iter().zip(times) {
             let (angle, range_m) = direction(point);
-            if range_m.is_finite() && range_m >= NEAREST_M {
+            if range_m.is_finite() && range_m >= NEAREST_M && time.is_finite() {
                 let sum = &mut sums[angle / ELEVATIONS];
                 *sum = [sum[0] + f64::from(time), sum[1] + 1.0];
             }
@@ -256,6 +256,10 @@ mod tests {
         let mut raw = sweep(0.0);
         let path = RigidTransform::translation(0.0, 2.0, 0.0);
         let mut times = vec![0.5; raw.len()];
+        // A time that is no number is none.
+        for time in times.iter_mut().step_by(7) {
+            *time = f32::NAN;
+        }
         // Some drivers write the origin where there is no return.
         raw.extend(vec![[0.0; 3]; 10_000]);
         times.extend(vec![0.0; 10_000]);

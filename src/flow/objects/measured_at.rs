@@ -34,6 +34,9 @@ impl ObjectSearch {
         target: TimedPoints<'_>,
         elapsed_s: f32,
     ) {
+        if self.motions.count() == 0 {
+            return;
+        }
         let mut rows: Vec<Vec<u32>> = vec![Vec::new(); self.motions.count()];
         for (row, &cluster) in self.parts.of.iter().enumerate() {
             let motion = self.parts.motions.get(cluster as usize).copied().flatten();
@@ -49,7 +52,8 @@ impl ObjectSearch {
                 let way = self.motions.displacement(motion as u32, from);
                 let moved = core::array::from_fn(|a| from[a] + way[a]);
                 let (found, _) = met.nearest(moved, MET_M)?;
-                Some(target.times[found as usize] - source.times[row])
+                let later = target.times[found as usize] - source.times[row];
+                later.is_finite().then_some(later)
             };
             let later: Vec<f32> = stride_sample(rows, SAMPLED)
                 .iter()
@@ -95,9 +99,12 @@ mod tests {
             seconds: SearchSeconds::default(),
             interrupted: None,
         };
+        // A time that is no number is none.
+        let mut times = [0.05; 20];
+        times[7] = f32::NAN;
         let from = TimedPoints {
             points: &source,
-            times: &[0.05; 20],
+            times: &times,
         };
         let to = TimedPoints {
             points: &target,

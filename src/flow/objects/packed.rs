@@ -4,7 +4,7 @@
 use bytemuck::{Pod, Zeroable};
 
 use super::clouds::TargetCloud;
-use super::cluster_cost::Cost;
+use super::cluster_cost::{Cost, JUDGED};
 use super::evidence::NeighborEvidence;
 use super::hough::{self, TranslationVotes};
 use super::hypothesis::Hypothesis;
@@ -15,8 +15,7 @@ use crate::flow::data::Point;
 use crate::flow::options::ObjectOptions;
 use crate::flow::spatial::IndexRecord;
 
-/// Most points of a sample of a sweep around a cluster, and words of a bin of the votes.
-const JUDGED: usize = 200;
+/// Words of a bin of the votes.
 const BIN_WORDS: usize = 2;
 /// Limits of the kernel: sweeps that clusters are matched to, points of one, initial guesses, and bins
 /// of the votes on each side.

@@ -51,7 +51,7 @@ pub(super) fn coarse(points: &[Point]) -> Surfels {
 }
 
 /// The motion near `prior` with the best score, accurate to some centimetres; `prior` where no fit
-/// scores above the margin.
+/// scores above the margin. Where `control` interrupts, no further guesses are tried.
 pub(super) fn search(
     source: &Surfels,
     target: &Surfels,
@@ -72,16 +72,17 @@ pub(super) fn search(
     let mut ends = tried(&starts(prior, x, |drive, turn| {
         near.contains(&drive) && turn == 0
     }));
-    if !agree(&ends) {
+    let goes_on = || control.interrupt().is_none();
+    if goes_on() && !agree(&ends) {
         let turned = |drive, turn| near.contains(&drive) && near.contains(&turn) && turn > 0;
         ends.extend(tried(&starts(prior, x, turned)));
     }
     let is_doubtful = |(motion, _): &(_, _)| fit.upright_score(motion, &TRIAL) < UPRIGHT_PLAIN;
-    if !agree(&ends) && ends.iter().all(is_doubtful) {
+    if goes_on() && !agree(&ends) && ends.iter().all(is_doubtful) {
         let is_far = |drive, turn| !(near.contains(&drive) && near.contains(&turn));
         ends.extend(tried(&starts(prior, x, is_far)));
         // The y axis of some sensors is forward.
-        if ends.iter().all(is_doubtful) {
+        if goes_on() && ends.iter().all(is_doubtful) {
             ends.extend(tried(&starts(prior, y, |drive, _| drive > 0)));
         }
     }

@@ -10,9 +10,6 @@ use rayon::prelude::*;
 use crate::flow::data::{Point, get_or_compute, stride_sample};
 use crate::flow::spatial::{ColumnIndex, PlaneFit};
 
-/// Bound on the points of a column of the index.
-const MOST_IN_A_COLUMN: usize = 4096;
-
 /// Points whose surfels one thread computes at a time.
 const POINTS_AT_ONCE: usize = 256;
 
@@ -40,11 +37,7 @@ impl Surfels {
     /// Surfels of `points`, metres, fitted to their neighbors within `within_m` metres.
     pub(super) fn new(points: &[Point], within_m: f32) -> Self {
         let mut points = points.to_vec();
-        let mut index = ColumnIndex::sorted(&mut points, within_m);
-        if let Some(rows) = index.uncrowded_rows(MOST_IN_A_COLUMN) {
-            points = rows.iter().map(|&row| points[row as usize]).collect();
-            index = ColumnIndex::sorted(&mut points, within_m);
-        }
+        let index = ColumnIndex::sorted_uncrowded(&mut points, within_m);
         Self {
             within_m,
             flats: points.iter().map(|_| OnceLock::new()).collect(),

@@ -13,6 +13,9 @@ use super::tiles::Tiles;
 use crate::flow::data::{Point, stride_sample};
 use crate::flow::simd::Isa;
 
+/// Most points of a column after [`ColumnIndex::uncrowded_rows`]. Real sweeps have up to 180 in a column
+/// of 0.35 m, one a voxel of 0.1 m.
+const MOST_IN_A_COLUMN: usize = 512;
 /// Side of a square, in columns. Its centers share one search.
 const TOGETHER: f32 = 5.0;
 
@@ -45,18 +48,29 @@ impl ColumnIndex {
         index
     }
 
+    /// [`Self::sorted`] without the points that crowd a column, see [`Self::uncrowded_rows`].
+    pub(crate) fn sorted_uncrowded(points: &mut Vec<Point>, column_m: f32) -> Self {
+        let index = Self::sorted(points, column_m);
+        let Some(rows) = index.uncrowded_rows() else {
+            return index;
+        };
+        *points = rows.iter().map(|&row| points[row as usize]).collect();
+        Self::sorted(points, column_m)
+    }
+
     /// The input rows, in ascending order, without those that crowd a column: of a column with more
-    /// than `most` points, `most` are left, evenly chosen. None where no column has more.
+    /// than 512 points, 512 are left, evenly chosen. None where no column has more.
     ///
     /// A query looks at all points of a column, however high they lie. A tower of points, which no
     /// sensor sees, would make the cost of all queries quadratic.
-    pub(crate) fn uncrowded_rows(&self, most: usize) -> Option<Vec<u32>> {
+    pub(crate) fn uncrowded_rows(&self) -> Option<Vec<u32>> {
         let columns = self.slots.tiles.begins().windows(2);
         let columns = columns.map(|ends| &self.rows[ends[0] as usize..ends[1] as usize]);
-        if columns.clone().all(|rows| rows.len() <= most) {
+        if columns.clone().all(|rows| rows.len() <= MOST_IN_A_COLUMN) {
             return None;
         }
-        let mut rows: Vec<u32> = columns.flat_map(|rows| stride_sample(rows, most)).collect();
+        let uncrowded = columns.flat_map(|rows| stride_sample(rows, MOST_IN_A_COLUMN));
+        let mut rows: Vec<u32> = uncrowded.collect();
         rows.sort_unstable();
         Some(rows)
     }

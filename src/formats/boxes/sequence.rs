@@ -54,7 +54,8 @@ impl<'a> BoxSequence<'a> {
                 let index = state.sweep as usize;
                 let in_sweep = boxes.get_mut(index).ok_or_else(|| {
                     KIND.malformed(format!(
-                        "track {} is in sweep {index}, and the last of the {} given is sweep {}",
+                        "track {} is in sweep {index}, and of {} given sweeps the last is sweep {}: give all sweeps of \
+                         the tracks",
                         track.id,
                         sweeps.len(),
                         sweeps.len().saturating_sub(1)

@@ -106,7 +106,7 @@ fn take_back(
     effects.events.push(Event::LeaseExpired(job.id));
     let error = JobError {
         code: "lease_expired".to_owned(),
-        message: "the device gave no sign of life".to_owned(),
+        message: "the worker sent no heartbeat".to_owned(),
         retryable: true,
     };
     leases::fail(sql, effects, options, job, error)?;
@@ -135,7 +135,7 @@ fn look_after_queued(
     let (code, message) = match job.deadline {
         Some(_) => (
             "deadline_in_queue",
-            "the deadline passed before a device was free",
+            "the deadline passed before the work began",
         ),
         None => (
             "too_old",

@@ -19,6 +19,9 @@ Matrix: TypeAlias = npt.NDArray[np.float64]
 """4 x 4 or 6 x 6 float64."""
 LONGEST_SWEEP = 1.0
 """Seconds from the first point of a sweep to the last."""
+TRANSPOSED_ROWS = range(3, 9)
+MOST_COLUMNS = 64
+"""An array with so many rows and more columns than this is transposed: its rows are x, y, z and perhaps others."""
 LATEST = 1000.0
 """Seconds from the time of a sweep to a point. float32 has steps of less than 0.1 ms up to here."""
 
@@ -38,6 +41,8 @@ def points(name: str, value: Any) -> Points:
     array = _array(name, value, "fiu", "numbers")
     if array.ndim != 2 or array.shape[1] < 3:
         raise InputError(f"{name} has shape {array.shape}: N x 3 is needed")
+    if array.shape[0] in TRANSPOSED_ROWS and array.shape[1] > MOST_COLUMNS:
+        raise InputError(f"{name} has shape {array.shape}, but each row is a point: pass the transposed array, N x 3")
     return np.require(array[:, :3], dtype=np.float32, requirements=["C", "A"])
 
 

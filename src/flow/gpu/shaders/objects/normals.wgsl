@@ -1,8 +1,6 @@
 // The normals of the target points: mirrors TargetCloud::find_normals and the plane of Neighborhood. One
 // invocation fits the plane around one point of one view.
 
-// The index of the view of this dispatch.
-var<immediate> own_view: u32;
 @group(0) @binding(4) var<storage, read_write> normals: array<vec4<f32>>;
 
 // Least number of points of a plane, its center included.
@@ -93,7 +91,7 @@ fn plane_normal(near: Neighborhood) -> vec3<f32> {
 
 @compute @workgroup_size(64)
 fn find_normals(@builtin(global_invocation_id) id: vec3<u32>) {
-    let view = views[own_view];
+    let view = views[id.y];
     let slot = id.x;
     if slot >= view.free.count + view.taken.count { return; }
     let center = points[view.targets + slot].xyz;
