@@ -1,8 +1,9 @@
-//! Tests of what a server tells of itself: `/v1/info`, the metrics of the machine, traces in the log.
+//! Tests of what a server tells of itself: `/v1/info`, the document of its API, the metrics of the
+//! machine, traces in the log.
 
 use std::process::Command;
 
-use reqwest::Client;
+use reqwest::{Client, StatusCode};
 use serde_json::{Value, json};
 
 use crate::clouds::{form, small_pair};
@@ -153,4 +154,39 @@ fn variables_that_kubernetes_sets_for_a_service_named_fnsf_serve_are_no_configur
     for (name, value) in [("PORT", "8080"), ("SERVICE", "8080"), ("PORTS_80", "8080")] {
         assert!(!printed(&format!("FNSF_SERVE_{name}"), value), "{name}");
     }
+}
+
+#[tokio::test]
+async fn the_documentation_names_every_route() {
+    let server = Server::start(&[]);
+    let document = reqwest::get(server.url("/openapi.json"))
+        .await
+        .expect("an answer");
+    let document: Value = document.json().await.expect("JSON");
+    let paths = document["paths"].as_object().expect("paths");
+    for (path, methods) in [
+        ("/v1/info", vec!["get"]),
+        ("/v1/flow", vec!["post"]),
+        ("/v1/sequences", vec!["post"]),
+        ("/v1/jobs", vec!["get", "post"]),
+        ("/v1/jobs/{id}", vec!["delete", "get"]),
+        ("/v1/jobs/{id}/requeue", vec!["post"]),
+        ("/v1/jobs/{id}/events", vec!["get"]),
+        ("/v1/jobs/{id}/result", vec!["get"]),
+        ("/v1/jobs/{id}/tracks", vec!["get"]),
+        ("/v1/jobs/{id}/scene", vec!["get"]),
+        ("/v1/jobs/{id}/sweeps/{index}", vec!["get"]),
+        ("/v1/jobs/{id}/share", vec!["post"]),
+        ("/v1/queue", vec!["get"]),
+        ("/v1/street/{sweep}", vec!["get"]),
+    ] {
+        let known = paths
+            .get(path)
+            .unwrap_or_else(|| panic!("{path} is missing"));
+        let known: Vec<&String> = known.as_object().expect("methods").keys().collect();
+        assert_eq!(known, methods, "{path}");
+    }
+    assert_eq!(paths.len(), 14);
+    let page = reqwest::get(server.url("/docs/")).await.expect("an answer");
+    assert_eq!(page.status(), StatusCode::OK);
 }

@@ -207,7 +207,7 @@ mod tests {
         let taken = words.take("points", 60, &Uncontrolled).expect("free");
         let panicked = catch_unwind(|| words.take("points", 80, &Panics));
         assert!(panicked.is_err());
-        words.take("points", 40, &Over).expect("nobody waits");
+        words.take("points", 40, &Over).expect("the line is empty");
         words.give_back(taken, 60);
     }
 

@@ -108,7 +108,7 @@ impl<R, D> Shared<R, D> {
                     }
                     Ok(_) => {}
                     Err(panic) => {
-                        // Nobody may submit a request whose owner is gone.
+                        // The caller frees the buffers of the request, so it must not be submitted later.
                         while !state.withdraw(ticket) && state.done.remove(&ticket).is_none() {
                             state = self.waited(state, ticket);
                         }
@@ -314,38 +314,41 @@ mod tests {
         assert_eq!(of_each.to_string(), error.to_string());
     }
 
-    #[test]
-    fn a_request_whose_owner_panics_is_withdrawn() {
+    /// Calls `work` while the request 0 is submitted. Returns how that ended.
+    fn while_submitting(
+        work: impl FnOnce(&Shared<u32, (u32, usize)>, &Watchdog, &Counted),
+    ) -> Ended {
         let (how, begins, end) = counted();
-        let shared = Shared::default();
-        let watchdog = Watchdog::default();
-        thread::scope(|scope| {
-            let first = scope.spawn(|| shared.run(&watchdog, 0, &how, &|| None::<()>));
+        let (shared, watchdog) = (Shared::default(), Watchdog::default());
+        let first = thread::scope(|scope| {
+            let first = scope.spawn(|| shared.run(&watchdog, 0, &how, &|| None));
             begins.recv().expect("a submission");
+            work(&shared, &watchdog, &how);
+            end.send(()).expect("a receiver");
+            first.join().expect("no panic")
+        });
+        assert!(locked(&shared.state).waiting.is_empty());
+        first
+    }
+
+    #[test]
+    fn a_request_whose_caller_panics_is_withdrawn() {
+        let first = while_submitting(|shared, watchdog, how| {
             let panics = || -> Option<()> { unreachable!("as a control of a caller may") };
-            let second = || shared.run(&watchdog, 1, &how, &panics);
+            let second = || shared.run(watchdog, 1, how, &panics);
             assert!(catch_unwind(AssertUnwindSafe(second)).is_err());
             assert!(locked(&shared.state).waiting.is_empty());
-            end.send(()).expect("a receiver");
-            assert!(first.join().expect("no panic").is_ok());
         });
+        assert!(first.is_ok());
     }
 
     #[test]
     fn a_request_that_is_over_before_its_submission_is_withdrawn() {
-        let (how, begins, end) = counted();
-        let shared = Shared::default();
-        let watchdog = Watchdog::default();
-        thread::scope(|scope| {
-            let first = scope.spawn(|| shared.run(&watchdog, 0, &how, &|| None::<&str>));
-            begins.recv().expect("a submission");
-            let over = shared.run(&watchdog, 1, &how, &|| Some("over"));
+        let first = while_submitting(|shared, watchdog, how| {
+            let over = shared.run(watchdog, 1, how, &|| Some("over"));
             assert_eq!(over.expect("no error"), ControlFlow::Break("over"));
-            end.send(()).expect("a receiver");
-            let first = first.join().expect("no panic").expect("no error");
-            // It was submitted, so it ends with what was done.
-            assert_eq!(first, ControlFlow::Continue((0, 1)));
         });
-        assert!(locked(&shared.state).waiting.is_empty());
+        // It was submitted, so it ends with what was done.
+        assert_eq!(first.expect("no error"), ControlFlow::Continue((0, 1)));
     }
 }

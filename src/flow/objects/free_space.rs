@@ -256,7 +256,7 @@ mod tests {
         let mut raw = sweep(0.0);
         let path = RigidTransform::translation(0.0, 2.0, 0.0);
         let mut times = vec![0.5; raw.len()];
-        // A time that is no number is none.
+        // NaN times are ignored.
         for time in times.iter_mut().step_by(7) {
             *time = f32::NAN;
         }

@@ -99,7 +99,7 @@ mod tests {
             seconds: SearchSeconds::default(),
             interrupted: None,
         };
-        // A time that is no number is none.
+        // NaN times are ignored.
         let mut times = [0.05; 20];
         times[7] = f32::NAN;
         let from = TimedPoints {
